@@ -14,11 +14,11 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
+from xml.etree import ElementTree
 
 import numpy as np
 import trimesh
 import yourdfpy
-from lxml import etree
 from scipy.spatial import ConvexHull, QhullError
 from scipy.spatial.transform import Rotation
 
@@ -338,14 +338,14 @@ def read_object(folder: Path, *, continuous_range: bool = False, allow_missing: 
 
 def _parse_urdf(reader: _Reader, urdf: str) -> yourdfpy.Robot:
     try:
-        # Entities could read other files or explode; nothing in a URDF needs them.
-        root = etree.parse(reader.path(urdf, urdf), etree.XMLParser(resolve_entities=False, no_network=True))
-    except (etree.XMLSyntaxError, OSError) as e:
+        root = ElementTree.fromstring(reader.path(urdf, urdf).read_bytes())
+    except (ElementTree.ParseError, OSError, ValueError) as e:
         raise reader.error(f"not XML ({e}); download the object again", urdf) from None
-    if root.docinfo.doctype or root.getroot().tag != "robot":
-        raise reader.error("not a URDF, whose root is <robot> without a document type", urdf)
+    if root.tag != "robot":
+        raise reader.error(f"root is <{root.tag}>, not <robot>; give a URDF", urdf)
     try:
-        data = etree.tostring(root.getroot())
+        # Written again, it has no document type left: yourdfpy's parser would open files that one names.
+        data = ElementTree.tostring(root)
         robot = yourdfpy.URDF.load(io.BytesIO(data), build_scene_graph=False, load_meshes=False).robot
     except Exception as e:  # yourdfpy raises whatever its parsing runs into
         raise reader.error(f"not a readable URDF ({type(e).__name__}: {e}); repair it", urdf) from None
@@ -434,10 +434,10 @@ def _semantics(reader: _Reader) -> dict[str, str]:
 
 
 def _visuals(reader: _Reader, urdf: str, link: yourdfpy.Link) -> Iterator[Visual]:
-    wanted = [v for v in link.visuals if v.geometry is not None]
+    wanted = [(v, v.geometry) for v in link.visuals if v.geometry is not None]
     missing, empty = [], []
-    for i, visual in enumerate(wanted):
-        geometry, file = visual.geometry, None
+    for i, (visual, geometry) in enumerate(wanted):
+        file = None
         if geometry.mesh is not None:
             file = geometry.mesh.filename
             if not file:
