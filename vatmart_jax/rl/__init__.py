@@ -1,0 +1,1 @@
+"""TD3 with hindsight: knows states, actions and rewards; neither physics nor files."""

@@ -1,0 +1,427 @@
+"""The environment: one trial is a start (view, contact point, hand orientation, task) and four waypoints.
+
+Pure functions on a batch of B trials with explicit keys:
+
+    env = Env(scenes, views, TASKS["push-door"])
+    state = env.reset(key)
+    state = env.step(state, action)      # four times; action in [-1, 1]^6
+
+The policy sees and acts in a joint-local frame (origin at the contact point, x along the part's motion in the
+task's sense, z along the joint's axis), in which all doors look alike; trajectories are recorded in the object frame.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+
+from vatmart_jax import geometry as g
+from vatmart_jax.bank import HINGE, SLIDE, SceneBank, Scenes, ViewBank
+from vatmart_jax.physics import PhysicsConfig, PhysicsState, make_physics
+from vatmart_jax.physics.controller import hand_target, waypoint_controls
+from vatmart_jax.physics.template import FINGER_OPEN, FINGERS, HAND, PART, TIP
+
+OBSERVATION, ACTION = 33, 6
+
+
+@dataclass(frozen=True)
+class Task:
+    """What is asked of a part: open or close it by some amount."""
+
+    name: str
+    joint_type: int  # HINGE or SLIDE
+    opening: bool  # pull, or push
+    low: float  # smallest amount, rad or unit lengths
+    high: float
+
+
+_DOOR, _DRAWER = (np.radians(10).item(), np.radians(70).item()), (0.1, 0.7)
+TASKS = {
+    task.name: task
+    for task in (
+        Task("push-door", HINGE, False, *_DOOR),
+        Task("pull-door", HINGE, True, *_DOOR),
+        Task("push-drawer", SLIDE, False, *_DRAWER),
+        Task("pull-drawer", SLIDE, True, *_DRAWER),
+    )
+}
+
+
+@dataclass(frozen=True)
+class EnvConfig:
+    """Sizes and limits of a trial. Lengths in units, angles in rad."""
+
+    batch: int = 256
+    """trials that run at once"""
+    move_range: float = 0.35
+    """largest move of the fingertips per waypoint and axis"""
+    turn_range: float = float(np.radians(45))
+    """largest turn of the hand per waypoint, about each axis"""
+    turn_limit: float = float(np.radians(80))
+    """largest turn from the start pose: Euler angles stay regular"""
+    standoff: float = 0.02
+    """fingertips start this far from the contact point"""
+    cone: float = float(np.radians(30))
+    """the hand approaches within this angle of the inward normal"""
+    grasp_depth: float = 0.025
+    """pulling: the open fingers advance this far past the contact point before they close"""
+    grasp_min: float = 0.003
+    """opening between closed fingers from which on something is held"""
+    guided_share: float = 0.9
+    """share of contact points drawn from promising ones: faces that point against the motion (push), handles (pull)"""
+    tolerance: float = 0.15
+    """success: the part moved by the task within this share of it"""
+
+
+@struct.dataclass
+class Start:
+    """Where B trials begin."""
+
+    view: jax.Array  # [B] int32, index into the environment's views
+    contact: jax.Array  # [B] int32, index into that view's contacts
+    task: jax.Array  # [B] positive amount to move the part by, rad or unit lengths
+    rotation: jax.Array  # [B, 3, 3] hand frame, object frame
+
+
+@struct.dataclass
+class EnvState:
+    """B trials, K = 4 waypoints."""
+
+    start: Start
+    point: jax.Array  # [B, 3] contact point at the start, object frame
+    frame: jax.Array  # [B, 3, 3] joint-local frame, object frame
+    q0: jax.Array  # [B] opening at the start
+    physics: PhysicsState
+    ctrl: jax.Array  # [B, 8] actuator targets in force
+    tip: jax.Array  # [B, 3] commanded move of the fingertips since the start pose, object frame
+    euler: jax.Array  # [B, 3] commanded hand angles, start frame
+    waypoint: jax.Array  # [] int32, waypoints done
+    residuals: jax.Array  # [B, K, 6] commanded residuals so far, zeros after the end
+    progress: jax.Array  # [B, K] how far the part had moved in the task's sense after each waypoint
+    in_collision: jax.Array  # [B] bool, the start pose touches the object
+    held: jax.Array  # [B] bool, the part is held (always true when pushing)
+    valid: jax.Array  # [B] bool, free start, grasp made if one is needed, physics sound
+    obs: jax.Array  # [B, 33]
+    reward: jax.Array  # [B]
+    done: jax.Array  # [B] bool
+    success: jax.Array  # [B] bool, now within tolerance (and still held)
+    metrics: dict[str, jax.Array]  # reward terms, raw, [B] each
+    info: dict[str, jax.Array]
+
+    @property
+    def moved(self) -> jax.Array:
+        """[B] how far the part has moved in the task's sense, rad or unit lengths."""
+        return self.info["moved"]
+
+    @property
+    def trajectory(self) -> jax.Array:
+        """[B, 30] the commanded trajectory, zero padded."""
+        return g.pack_trajectory(self.start.rotation, self.residuals)
+
+
+class Env:
+    """Trials of one task over the Scenes and views of a bank."""
+
+    def __init__(
+        self,
+        bank: SceneBank,
+        views: ViewBank,
+        task: Task,
+        impl: str = "c",
+        config: EnvConfig | None = None,
+        physics: PhysicsConfig | None = None,
+    ):
+        """Keeps the Scenes of the task's joint type and the views that leave room for the task.
+
+        Raises ValueError where nothing is left.
+        """
+        scenes = np.flatnonzero(bank.joint_type == task.joint_type)
+        kind = "door (hinge)" if task.joint_type == HINGE else "drawer (slide)"
+        if len(scenes) == 0:
+            raise ValueError(f"the data has no {kind}, which task {task.name} needs")
+        views = views.of_scenes(scenes)
+        bank = bank.select(scenes)
+        room = bank.width[views.scene] - views.q if task.opening else views.q
+        views = views.select((views.opening == task.opening) & (room >= task.low))
+        if len(views) == 0:
+            raise ValueError(f"the data has no view of a {kind} that can be moved by task {task.name}")
+        self.task, self.config = task, config or EnvConfig()
+        self.bank, self.views = bank, views
+        self.physics = make_physics(bank, impl, physics)
+        self._scenes = Scenes.of(bank)
+        self._view_scene = jnp.asarray(views.scene)
+        self._view_q = jnp.asarray(views.q)
+        self._view_cdf = jnp.asarray(np.cumsum(_balanced(bank, views)), jnp.float32)
+        self._contacts = jnp.asarray(views.contacts)
+        self._normals = jnp.asarray(views.contact_normals)
+        self._promising = jnp.asarray(_promising(bank, views, task))
+
+    def sample(self, key: jax.Array, n: int) -> Start:
+        """n random starts: category uniform, then object, Scene, view; task; contact; approach; roll.
+
+        Tasks follow the paper's order given the view: amount uniform first, then a start that leaves room for it.
+        Consumes the key.
+        """
+        kv, kt, kc, kg, ka, kr = jax.random.split(key, 6)
+        view = jnp.searchsorted(self._view_cdf, jax.random.uniform(kv, (n,)) * self._view_cdf[-1])
+        view = jnp.minimum(view, len(self.views) - 1).astype(jnp.int32)
+        task = self.sample_task(kt, view)
+        # A guided start weighs promising contacts so much that others are drawn only where a view has none.
+        guided = jax.random.uniform(kg, (n, 1)) < self.config.guided_share
+        contact = jax.random.categorical(kc, jnp.where(guided & self._promising[view], 20.0, 0.0), axis=-1)
+        up = g.cone_direction(ka, -self._normals[view, contact], self.config.cone)
+        rotation = g.gripper_frame(up, jax.random.normal(kr, up.shape))
+        return Start(view, contact.astype(jnp.int32), task, rotation)
+
+    def sample_task(self, key: jax.Array, view: jax.Array) -> jax.Array:
+        """[B] amounts for views [B]: density of t given q when t is uniform and q then uniform where t fits."""
+        width, q = self._scenes.width[self._view_scene[view]], self._view_q[view]
+        room = width - q if self.task.opening else q
+        high = jnp.minimum(self.task.high, room)
+        # p(t | q) is proportional to 1 / (width - t) on [low, high]; inverted here.
+        rest = jnp.maximum(width - self.task.low, 1e-3)
+        share = jnp.maximum(width - high, 1e-3) / rest
+        t = width - rest * share ** jax.random.uniform(key, view.shape)
+        return jnp.clip(t, self.task.low, jnp.maximum(high, self.task.low))
+
+    def reset(self, key: jax.Array, pool: Start | None = None) -> EnvState:
+        """A batch of random trials; some starts collide or fail to grasp and are done at once (`valid`).
+
+        With a pool of known starts, trials begin at random ones of these, with new tasks. Consumes the key.
+        """
+        if pool is None:
+            return self.begin(self.sample(key, self.config.batch))
+        kp, kt = jax.random.split(key)
+        chosen = jax.random.randint(kp, (self.config.batch,), 0, len(pool.view))
+        start = jax.tree.map(lambda x: x[chosen], pool)
+        return self.begin(start.replace(task=self.sample_task(kt, start.view)))
+
+    def begin(self, start: Start) -> EnvState:
+        """Put the hand at its start poses and, when pulling, grasp."""
+        config, pulling = self.config, self.task.opening
+        scene = self._view_scene[start.view]
+        q0 = self._view_q[start.view]
+        point = self._contacts[start.view, start.contact]
+        up = start.rotation[:, :, 2]
+        hand = point - (TIP + config.standoff) * up
+        n = len(scene)
+        fingers = jnp.full((n,), FINGER_OPEN if pulling else 0.0)
+        qpos = jnp.concatenate([q0[:, None], jnp.zeros((n, 6)), fingers[:, None], fingers[:, None]], -1)
+        physics = self.physics.reset(scene, jnp.concatenate([hand, g.quat_from_matrix(start.rotation)], -1), qpos)
+        in_collision = physics.in_contact | physics.diverged
+        zero = jnp.zeros((n, 3))
+        ctrl = hand_target(zero, zero, start.rotation, fingers)
+        tip = zero
+        held = ~in_collision
+        if pulling:
+            tip = (config.standoff + config.grasp_depth) * up
+            for opening in (FINGER_OPEN, 0.0):  # advance, then close
+                physics, ctrl = self._drive(
+                    physics, ctrl, tip, zero, start.rotation, jnp.full((n,), opening), ~in_collision
+                )
+            held = ~in_collision & self._holds(physics)
+        valid = ~in_collision & held & ~physics.diverged
+        nothing = jnp.zeros((n,))
+        state = EnvState(
+            start=start,
+            point=point,
+            frame=self._joint_frame(scene, point),
+            q0=q0,
+            physics=physics,
+            ctrl=ctrl,
+            tip=tip,
+            euler=zero,
+            waypoint=jnp.zeros((), jnp.int32),
+            residuals=jnp.zeros((n, g.WAYPOINTS, 6)),
+            progress=jnp.zeros((n, g.WAYPOINTS)),
+            in_collision=in_collision,
+            held=held,
+            valid=valid,
+            obs=jnp.zeros((n, OBSERVATION)),
+            reward=nothing,
+            done=~valid,
+            success=jnp.zeros((n,), bool),
+            metrics=dict.fromkeys(("guidance", "distance", "far", "success"), nothing),
+            info={"moved": self._moved(physics, q0), "tip_distance": nothing},
+        )
+        obs, distance = self._observe(state)
+        return state.replace(obs=obs, info={**state.info, "tip_distance": distance})
+
+    def step(self, state: EnvState, action: jax.Array) -> EnvState:
+        """One waypoint from an action [B, 6] in [-1, 1]: move of the fingertips and turn (rotation vector) of the
+        hand, both in the joint-local frame. Trials that are done stay as they are.
+        """
+        config = self.config
+        move = g.rotate(state.frame, action[:, :3] * config.move_range)
+        # The hand's rotation as seen in the joint-local frame, turned about that frame's axes.
+        into = jnp.einsum("bji,bjk->bik", state.start.rotation, state.frame)
+        turned = into.swapaxes(-1, -2) @ g.matrix_from_euler(state.euler) @ into
+        vector = g.rotvec_from_matrix(g.matrix_from_rotvec(action[:, 3:] * config.turn_range) @ turned)
+        angle = jnp.linalg.norm(vector, axis=-1, keepdims=True)
+        vector = vector * jnp.minimum(1.0, config.turn_limit / jnp.maximum(angle, 1e-6))
+        euler = g.euler_from_matrix(into @ g.matrix_from_rotvec(vector) @ into.swapaxes(-1, -2))
+        return self._advance(state, jnp.concatenate([move, euler - state.euler], -1), stop_at_success=True)
+
+    def execute(self, start: Start, residuals: jax.Array) -> EnvState:
+        """Whole trials, open loop, never stopped early: residuals [B, 4, 6] as `geometry.pack_trajectory` has them."""
+
+        def waypoint(state, residual):
+            return self._advance(state, residual, stop_at_success=False), None
+
+        return jax.lax.scan(waypoint, self.begin(start), residuals.swapaxes(0, 1))[0]
+
+    def _advance(self, state: EnvState, residual: jax.Array, stop_at_success: bool) -> EnvState:
+        active = ~state.done
+        residual = jnp.where(active[:, None], residual, 0.0)
+        tip, euler = state.tip + residual[:, :3], state.euler + residual[:, 3:]
+        closed = jnp.zeros(tip.shape[:1])
+        physics, ctrl = self._drive(state.physics, state.ctrl, tip, euler, state.start.rotation, closed, active)
+        before = state.moved
+        moved = jnp.where(active, self._moved(physics, state.q0), before)
+        held = state.held & (self._holds(physics) | ~active) if self.task.opening else state.held
+        valid = state.valid & ~physics.diverged
+        task = state.start.task
+        success = valid & held & (jnp.abs(task - moved) <= self.config.tolerance * task)
+        waypoint = state.waypoint + 1
+        over = (waypoint >= g.WAYPOINTS) | ~valid | ~held
+        state = state.replace(
+            physics=physics,
+            ctrl=jnp.where(active[:, None], ctrl, state.ctrl),
+            tip=tip,
+            euler=euler,
+            waypoint=waypoint,
+            residuals=state.residuals.at[:, state.waypoint].set(residual),
+            progress=jnp.where(jnp.arange(g.WAYPOINTS) >= state.waypoint, moved[:, None], state.progress),
+            held=held,
+            valid=valid,
+            success=success,
+            done=state.done | over | (success if stop_at_success else False),
+            info={**state.info, "moved": moved},
+        )
+        obs, distance = self._observe(state)
+        terms = reward_terms(task, before, moved, distance, success)
+        metrics = {name: jnp.where(active, value, 0.0) for name, value in terms.items()}
+        return state.replace(
+            obs=obs,
+            reward=sum(metrics.values()),
+            metrics=metrics,
+            info={**state.info, "tip_distance": distance},
+        )
+
+    def _drive(self, physics, ctrl, tip, euler, rotation, fingers, active) -> tuple[PhysicsState, jax.Array]:
+        target = hand_target(tip, euler, rotation, fingers)
+        path = waypoint_controls(ctrl, target, self.physics.config)
+        return self.physics.rollout(physics, path, active), target
+
+    def _holds(self, physics: PhysicsState) -> jax.Array:
+        return physics.qpos[:, FINGERS].sum(-1) > self.config.grasp_min
+
+    def _moved(self, physics: PhysicsState, q0: jax.Array) -> jax.Array:
+        return (physics.qpos[:, PART] - q0) * (1.0 if self.task.opening else -1.0)
+
+    def _motion_axis(self, scene: jax.Array) -> jax.Array:
+        """[B, 3] the joint's axis, signed so that positive motion is the task's."""
+        return self._scenes.axis[scene] * (1.0 if self.task.opening else -1.0)
+
+    def _joint_frame(self, scene: jax.Array, point: jax.Array) -> jax.Array:
+        axis = self._motion_axis(scene)
+        if self.task.joint_type == HINGE:
+            x = g.normalize(jnp.cross(axis, point - self._scenes.anchor[scene]))
+            z = axis
+        else:
+            x = axis
+            upright = jnp.array([0.0, 0.0, 1.0])
+            side = jnp.where(jnp.abs(x[:, 2:]) > 0.9, jnp.array([0.0, 1.0, 0.0]), upright)
+            z = g.normalize(side - jnp.sum(side * x, -1, keepdims=True) * x)
+        return jnp.stack([x, jnp.cross(z, x), z], -1)
+
+    def _contact_now(self, state: EnvState) -> jax.Array:
+        """[B, 3] where the contact point, which moves with the part, is now; object frame."""
+        scene = state.physics.scene
+        axis, change = self._scenes.axis[scene], (state.physics.qpos[:, PART] - state.q0)[:, None]
+        if self.task.joint_type == HINGE:
+            anchor = self._scenes.anchor[scene]
+            return anchor + g.rotate(g.matrix_from_rotvec(axis * change), state.point - anchor)
+        return state.point + axis * change
+
+    def _observe(self, state: EnvState) -> tuple[jax.Array, jax.Array]:
+        """The paper's 33 numbers in the joint-local frame [B, 33], and the fingertips' distance to the contact [B]."""
+        frame, start, physics = state.frame, state.start.rotation, state.physics
+        local = lambda v: g.unrotate(frame, v)  # noqa: E731
+        task, moved = state.start.task, state.moved
+        hand_q = physics.qpos[:, HAND]
+        hand = physics.gripper_pose[:, :3] + g.rotate(start, hand_q[:, :3])
+        now = start @ g.matrix_from_euler(hand_q[:, 3:])
+        tip = hand + TIP * now[:, :, 2]
+        start_in_frame = jnp.einsum("bji,bjk->bik", frame, start)
+        turn = g.rotvec_from_matrix(jnp.einsum("bji,bjk,blk,blm->bim", frame, now, start, frame))
+        contact = self._contact_now(state)
+        anchor, axis = self._scenes.anchor[physics.scene], self._motion_axis(physics.scene)
+        from_anchor = contact - anchor
+        nearest = anchor + jnp.sum(from_anchor * axis, -1, keepdims=True) * axis
+        arm = contact - nearest
+        length = jnp.linalg.norm(arm, axis=-1, keepdims=True)
+        obs = jnp.concatenate(
+            [
+                moved[:, None],
+                task[:, None],
+                (task - moved)[:, None],
+                local(physics.gripper_pose[:, :3] - state.point),
+                g.rot6d_from_matrix(start_in_frame),
+                local(tip - state.point),
+                turn,
+                10 * physics.qpos[:, FINGERS],
+                local(contact - state.point),
+                local(axis),
+                local(nearest - state.point),
+                length,
+                local(arm / jnp.maximum(length, 1e-6)),
+            ],
+            -1,
+        )
+        return obs, jnp.linalg.norm(tip - contact, axis=-1)
+
+
+def reward_terms(task, before, after, distance, success) -> dict[str, jax.Array]:
+    """The paper's extrinsic reward, term by term (section 4.1). All arguments [B]; distance from fingertip to contact."""
+    return {
+        "guidance": 300.0 * (jnp.abs(task - before) - jnp.abs(task - after)),
+        "distance": -150.0 * distance,
+        "far": -300.0 * (distance > 0.1),
+        "success": 500.0 * success,
+    }
+
+
+def _promising(bank: SceneBank, views: ViewBank, task: Task) -> np.ndarray:
+    """[V, C] bool: contacts on handles (pull), or on faces that point against the part's motion, off its axis (push)."""
+    if task.opening:
+        return views.contact_handle
+    scenes = Scenes.of(bank)
+    axis = -np.asarray(scenes.axis)[views.scene][:, None]
+    if task.joint_type == SLIDE:
+        return (views.contact_normals * axis).sum(-1) < -0.5
+    motion = np.cross(axis, views.contacts - np.asarray(scenes.anchor)[views.scene][:, None])
+    speed = np.linalg.norm(motion, axis=-1)
+    return ((views.contact_normals * motion).sum(-1) < -0.5 * speed) & (speed > 0.1)
+
+
+def _balanced(bank: SceneBank, views: ViewBank) -> np.ndarray:
+    """[V] probabilities: every category alike, then every object in it, Scene of it and view of that."""
+    probability = np.ones(len(views))
+    parents: list[tuple] = [()] * len(views)
+    levels = (bank.category[views.scene], bank.object_id[views.scene], views.scene, np.arange(len(views)))
+    for level in levels:
+        keys = [(*parent, key) for parent, key in zip(parents, level.tolist(), strict=True)]
+        children: dict[tuple, set] = {}
+        for parent, key in zip(parents, keys, strict=True):
+            children.setdefault(parent, set()).add(key)
+        probability /= [len(children[parent]) for parent in parents]
+        parents = keys
+    return probability
+
+
+__all__ = ["ACTION", "OBSERVATION", "SLIDE", "TASKS", "Env", "EnvConfig", "EnvState", "Start", "Task", "reward_terms"]

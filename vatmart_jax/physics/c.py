@@ -1,0 +1,132 @@
+"""Physics on CPU threads: `mujoco.batch.Batch` behind `jax.pure_callback`."""
+
+from __future__ import annotations
+
+import threading
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+from mujoco.batch import Batch
+
+from vatmart_jax.bank import SceneBank
+from vatmart_jax.physics.interface import PhysicsState
+from vatmart_jax.physics.template import N_CTRL, N_QPOS, SCENE_FIELDS, PhysicsConfig, template
+
+# float64 numbers a simulation carries between calls: position, velocity and the solver's warm start.
+_EXACT = ("qpos", "qvel", "qacc_warmstart")
+_DIVERGED = [
+    int(w) for w in (mujoco.mjtWarning.mjWARN_BADQPOS, mujoco.mjtWarning.mjWARN_BADQVEL, mujoco.mjtWarning.mjWARN_BADQACC)
+]  # fmt: skip
+
+
+class CPhysics:
+    """Bit-identical to plain `mujoco.mj_step` on each Scene's own model, whatever the batch and the threads.
+
+    Float64 state travels through JAX as its bits, so 32-bit JAX loses nothing between calls. `vmap` adds
+    simulations to the batch.
+    """
+
+    def __init__(self, bank: SceneBank, config: PhysicsConfig, threads: int = 0):
+        self.config = config
+        self._template = template(bank, config)
+        self._threads = threads  # 0: all cores
+        self._pools: dict[int, _Pool] = {}  # by number of simulations
+        self._lock = threading.Lock()  # a Batch serves one caller at a time
+
+    def reset(self, scene: jax.Array, gripper_pose: jax.Array, qpos: jax.Array) -> PhysicsState:
+        result = self._result(scene.shape)
+        outputs = jax.pure_callback(self._reset, result, scene, gripper_pose, qpos, vmap_method="broadcast_all")
+        return PhysicsState(scene, gripper_pose, *outputs)
+
+    def rollout(self, state: PhysicsState, ctrl: jax.Array, active: jax.Array) -> PhysicsState:
+        outputs = jax.pure_callback(
+            self._rollout, self._result(state.scene.shape), state, ctrl, active, vmap_method="broadcast_all"
+        )
+        return PhysicsState(state.scene, state.gripper_pose, *outputs)
+
+    def _result(self, batch: tuple[int, ...]):
+        shape = jax.ShapeDtypeStruct
+        return (
+            shape((*batch, N_QPOS), jnp.float32),
+            shape((*batch, N_QPOS), jnp.float32),
+            shape(batch, jnp.bool_),
+            shape(batch, jnp.bool_),
+            shape((*batch, 2 * len(_EXACT) * N_QPOS), jnp.uint32),
+        )
+
+    def _reset(self, scene, gripper_pose, qpos):
+        batch = np.shape(scene)
+        scene, pose = np.asarray(scene).reshape(-1), np.asarray(gripper_pose, np.float64).reshape(-1, 7)
+        exact = np.zeros((len(scene), len(_EXACT) * N_QPOS))
+        exact[:, :N_QPOS] = np.asarray(qpos).reshape(-1, N_QPOS)
+        with self._lock:
+            pool = self._pool(len(scene))
+            pool.load(np.arange(len(scene)), scene, pose, exact)
+            pool.batch.forward(stage=mujoco.mjtStage.mjSTAGE_POS.value)
+            contact = pool.contacts > 0
+        return self._pack(batch, exact, contact, ~np.isfinite(exact).all(1))
+
+    def _rollout(self, state, ctrl, active):
+        batch = np.shape(state.scene)
+        scene = np.asarray(state.scene).reshape(-1)
+        pose = np.asarray(state.gripper_pose, np.float64).reshape(-1, 7)
+        exact = np.ascontiguousarray(np.asarray(state.exact)).reshape(len(scene), -1).view(np.float64).copy()
+        ctrl = np.asarray(ctrl, np.float64).reshape(len(scene), -1, N_CTRL)
+        diverged = np.array(state.diverged).reshape(-1)
+        contact = np.array(state.in_contact).reshape(-1)
+        finite = np.isfinite(ctrl).all((1, 2))
+        diverged |= np.asarray(active).reshape(-1) & ~finite
+        ids = np.flatnonzero(np.asarray(active).reshape(-1) & ~diverged)
+        if len(ids):
+            with self._lock:
+                pool = self._pool(len(scene))
+                pool.load(ids, scene, pose, exact)
+                after, good = pool.run(ids, ctrl[ids])
+                exact[ids[good]] = after[good]
+                diverged[ids[~good]] = True
+                contact[ids] = pool.contacts[ids] > 0
+        return self._pack(batch, exact, contact, diverged)
+
+    def _pack(self, batch, exact, contact, diverged):
+        qpos, qvel = exact[:, :N_QPOS].astype(np.float32), exact[:, N_QPOS : 2 * N_QPOS].astype(np.float32)
+        rows = (qpos, qvel, contact, diverged, np.ascontiguousarray(exact).view(np.uint32))
+        return tuple(a.reshape(*batch, *a.shape[1:]) for a in rows)
+
+    def _pool(self, n: int) -> _Pool:
+        if n not in self._pools:
+            self._pools[n] = _Pool(self._template, n, self._threads)
+        return self._pools[n]
+
+
+class _Pool:
+    """A Batch of n simulations and which Scene each holds now."""
+
+    def __init__(self, template, n: int, threads: int):
+        self.batch = Batch(template.model, nsim=n, nthread=threads)
+        self._values = template.fields
+        self._expanded = {name: self.batch.expand(name) for name in SCENE_FIELDS}
+        self._scene = np.full(n, -1)
+        self._state = [self.batch.bind(name) for name in _EXACT]
+        self._pos, self._quat = self.batch.bind("mocap_pos"), self.batch.bind("mocap_quat")
+        self.contacts = self.batch.bind("ncon")
+
+    def load(self, ids: np.ndarray, scene: np.ndarray, pose: np.ndarray, exact: np.ndarray) -> None:
+        """Make simulations `ids` those of `scene`, `pose` and `exact` (rows of the whole batch)."""
+        changed = ids[self._scene[ids] != scene[ids]]
+        for name, rows in self._expanded.items():
+            rows[changed] = self._values[name][scene[changed]].reshape(len(changed), *rows.shape[1:])
+        self._scene[changed] = scene[changed]
+        for field, value in zip(self._state, np.split(exact, len(_EXACT), axis=1), strict=True):
+            field[ids] = value[ids]
+        # Mocap bodies: 0 is the object, at the origin; 1 is the gripper's base.
+        self._pos[ids, 1], self._quat[ids, 1] = pose[ids, :3], pose[ids, 3:]
+
+    def run(self, ids: np.ndarray, ctrl: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Step; returns the exact state [n, 27] of `ids` and which of them stayed good [n] bool."""
+        warned = self.batch.warning[ids][:, _DIVERGED].copy()
+        self.batch.rollout(ctrl.shape[1], control=ctrl, record=(), ids=ids)
+        after = np.concatenate([field[ids] for field in self._state], axis=1)
+        good = (self.batch.warning[ids][:, _DIVERGED] == warned).all((1, 2)) & np.isfinite(after).all(1)
+        return after, good

@@ -1,0 +1,128 @@
+"""TD3 (Fujimoto et al. 2018): twin critics as one vmapped ensemble, target smoothing, delayed policy."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import optax
+from flax import struct
+
+from vatmart_jax.rl.networks import Critic, Policy
+from vatmart_jax.rl.replay import Replay, Transition
+
+
+@dataclass(frozen=True)
+class TD3Config:
+    """Defaults found by measuring (docs/learning.md); the `paper` preset has the paper's."""
+
+    hidden: int = 512
+    batch: int = 256
+    learning_rate: float = 3e-4
+    discount: float = 0.9
+    polyak: float = 0.01
+    policy_delay: int = 2
+    target_noise: float = 0.1
+    target_noise_clip: float = 0.2
+    reward_scale: float = 0.01
+    """rewards of hundreds make values of hundreds, which Adam reaches slowly"""
+    capacity: int = 100_000
+    updates: int = 64
+    """gradient steps per batch of trials"""
+
+
+@struct.dataclass
+class TD3State:
+    """Everything that training carries; a pytree of arrays."""
+
+    policy: Any
+    critics: Any  # leading axis 2
+    target_policy: Any
+    target_critics: Any
+    policy_opt: optax.OptState
+    critic_opt: optax.OptState
+    updates: jax.Array  # [] int32
+
+
+class TD3:
+    """The learner: functions of TD3State."""
+
+    def __init__(self, config: TD3Config, observation: int, action: int):
+        self.config = config
+        self._policy, self._critic = Policy(config.hidden, action), Critic(config.hidden)
+        self._optimizer = optax.adam(config.learning_rate)
+        self._sizes = (observation, action)
+
+    def init(self, key: jax.Array) -> TD3State:
+        """Consumes the key."""
+        kp, kc = jax.random.split(key)
+        obs, action = (jnp.zeros((1, n)) for n in self._sizes)
+        policy = self._policy.init(kp, obs)
+        critics = jax.vmap(lambda k: self._critic.init(k, obs, action))(jax.random.split(kc, 2))
+        opt = self._optimizer
+        return TD3State(
+            policy, critics, policy, critics, opt.init(policy), opt.init(critics), jnp.zeros((), jnp.int32)
+        )
+
+    def act(self, policy: Any, obs: jax.Array) -> jax.Array:
+        """[B, 33] -> [B, 6] in [-1, 1]."""
+        return self._policy.apply(policy, obs)
+
+    def explore(self, policy: Any, obs: jax.Array, key: jax.Array, noise: jax.Array, random: jax.Array) -> jax.Array:
+        """Actions with Gaussian noise (share of the range); a share `random` of them uniform. Consumes the key."""
+        kn, ku, kr = jax.random.split(key, 3)
+        action = self.act(policy, obs)
+        action = jnp.clip(action + noise * jax.random.normal(kn, action.shape), -1, 1)
+        uniform = jax.random.uniform(ku, action.shape, minval=-1.0)
+        return jnp.where(jax.random.uniform(kr, (len(obs), 1)) < random, uniform, action)
+
+    def learn(self, state: TD3State, replay: Replay, key: jax.Array) -> tuple[TD3State, dict[str, jax.Array]]:
+        """`updates` gradient steps on the critics, one in `policy_delay` on the policy too. Consumes the key."""
+
+        def update(state, key):
+            ks, kn = jax.random.split(key)
+            return self._update(state, replay.sample(ks, self.config.batch), kn)
+
+        state, metrics = jax.lax.scan(update, state, jax.random.split(key, self.config.updates))
+        return state, jax.tree.map(jnp.mean, metrics)
+
+    def _values(self, critics: Any, obs: jax.Array, action: jax.Array) -> jax.Array:
+        return jax.vmap(self._critic.apply, (0, None, None))(critics, obs, action)
+
+    def _update(self, state: TD3State, steps: Transition, key: jax.Array):
+        config = self.config
+        noise = jax.random.normal(key, steps.action.shape) * config.target_noise
+        noise = jnp.clip(noise, -config.target_noise_clip, config.target_noise_clip)
+        next_action = jnp.clip(self.act(state.target_policy, steps.next_obs) + noise, -1, 1)
+        next_value = self._values(state.target_critics, steps.next_obs, next_action).min(0)
+        target = config.reward_scale * steps.reward + config.discount * (1 - steps.done) * next_value
+
+        def critic_loss(critics):
+            return jnp.mean((self._values(critics, steps.obs, steps.action) - target) ** 2)
+
+        loss, grads = jax.value_and_grad(critic_loss)(state.critics)
+        changes, critic_opt = self._optimizer.update(grads, state.critic_opt)
+        critics = optax.apply_updates(state.critics, changes)
+        state = state.replace(critics=critics, critic_opt=critic_opt, updates=state.updates + 1)
+
+        def policy_update(state: TD3State) -> TD3State:
+            first = jax.tree.map(lambda x: x[0], state.critics)
+
+            def policy_loss(policy):
+                return -jnp.mean(self._critic.apply(first, steps.obs, self.act(policy, steps.obs)))
+
+            grads = jax.grad(policy_loss)(state.policy)
+            changes, policy_opt = self._optimizer.update(grads, state.policy_opt)
+            policy = optax.apply_updates(state.policy, changes)
+            follow = lambda target, new: optax.incremental_update(new, target, config.polyak)  # noqa: E731
+            return state.replace(
+                policy=policy,
+                policy_opt=policy_opt,
+                target_policy=follow(state.target_policy, policy),
+                target_critics=follow(state.target_critics, state.critics),
+            )
+
+        state = jax.lax.cond(state.updates % config.policy_delay == 0, policy_update, lambda s: s, state)
+        return state, {"critic_loss": loss, "value": jnp.mean(target)}
