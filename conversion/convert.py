@@ -1,0 +1,299 @@
+"""PartNet-Mobility folders -> one folder per object, and the banks that training reads.
+
+Out folder: `<id>/` with model.xml, assets/, object.npz, report.json, picture.png for each object; scenes.npz and
+views.npz; splits.json; convert.json with what was asked and what was refused.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import multiprocessing
+import os
+import shutil
+import time
+import traceback
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import asdict, dataclass
+from importlib.metadata import version
+from multiprocessing.connection import Connection, wait
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+
+from conversion import partnet
+from conversion.decompose import DecomposeConfig, decompose, fidelity
+from conversion.mjcf import MjcfConfig, to_mjcf
+from conversion.partnet import ConvertedObject, ObjectError
+from conversion.report import picture, save_png
+
+FORMAT = 1  # of the per-object folder; raise it when a change of this package must reach folders that are up to date
+URDF_NAMES = ("mobility.urdf", "mobility_vhacd.urdf")
+TRAIN_CATEGORIES = ("StorageFurniture", "Door", "Microwave", "Refrigerator")  # paper, section 4.1
+TEST_CATEGORIES = ("Safe", "Table", "WashingMachine")
+SPLITS = ("train", "test_shapes", "test_categories", "extra")
+_SOURCE_SUFFIXES = (".urdf", ".json", ".txt", ".obj", ".stl", ".ply")
+
+
+@dataclass(frozen=True)
+class ConvertConfig(DecomposeConfig, MjcfConfig):
+    part_budget: int = 16
+    """Hulls per moving link."""
+    static_budget: int = 32
+    """Hulls of all that is fixed to the world."""
+    allow_missing: bool = False
+    """Convert objects with missing meshes, without them."""
+    continuous_range: bool = False
+    """Let joints without a limit turn or slide without end, instead of refusing the object."""
+    time_limit: float = 120.0
+    """Seconds per object; one that takes longer is refused."""
+    seed: int = 0
+    """Of everything random in the conversion."""
+
+
+@dataclass(frozen=True)
+class ConvertResult:
+    objects: int  # folders found
+    converted: int  # of them in the out folder now, whether made by this call or up to date
+    failed: list[dict[str, str]]  # id, reason
+    seconds: float
+
+
+def convert(sources: Sequence[Path], out: Path, config: ConvertConfig, jobs: int | None = None) -> ConvertResult:
+    """Convert object folders, or folders of such folders. jobs: processes, default one per core.
+
+    What is up to date (same files, configuration, library versions) is left as it is. An object that cannot be
+    converted is listed in the result, and its folder of an earlier run removed. Raises ObjectError where nothing could
+    be converted at all.
+    """
+    start = time.monotonic()
+    folders = _object_folders(sources, out)
+    keys = {f: _key(f, config) for f in folders}
+    splits = _splits(sources)
+    out.mkdir(parents=True, exist_ok=True)
+    record = _read_json(out / "convert.json")
+    refused = {r["id"]: r for r in record.get("failed", ()) if r.get("key") in keys.values()}
+    current: dict[str, str] = {}  # id -> key
+    failed: dict[str, dict[str, str]] = {}
+    work = []
+    for folder in folders:
+        name, key = folder.resolve().name, keys[folder]
+        if name in current or name in failed or any(name == f.resolve().name for f in work):
+            continue
+        if name in refused and refused[name]["key"] == key:
+            failed[name] = refused[name]
+        elif _read_json(out / name / "report.json").get("key") == key:
+            current[name] = key
+        else:
+            work.append(folder)
+    tasks = [(f, out, config, splits.get(f.resolve().name), keys[f]) for f in work]
+    for (folder, *_), error in _pool(_convert_one, tasks, jobs or os.cpu_count() or 1, config.time_limit):
+        name = folder.resolve().name
+        if error is None:
+            current[name] = keys[folder]
+        else:
+            failed[name] = {"id": name, "reason": error, "key": keys[folder]}
+            shutil.rmtree(out / name, ignore_errors=True)
+    failures = [failed[k] for k in sorted(failed)]
+    if not current:
+        if not any(out.iterdir()):
+            out.rmdir()
+        more = f" (and {len(failures) - 1} more objects refused)" if len(failures) > 1 else ""
+        raise ObjectError(failures[0]["reason"] + more)
+    _write_json(out / "convert.json", {"config": asdict(config), "versions": _versions(), "failed": failures})
+    _banks(out, current, config, record)
+    reasons = [{"id": f["id"], "reason": f["reason"]} for f in failures]
+    return ConvertResult(len(current) + len(failed), len(current), reasons, time.monotonic() - start)
+
+
+def _object_folders(sources: Sequence[Path], out: Path) -> list[Path]:
+    folders = []
+    for source in sources:
+        if not source.is_dir():
+            raise ObjectError(f"{source}: no such folder; name PartNet-Mobility object folders or a folder of them")
+        is_object = lambda p: any((p / n).exists() for n in URDF_NAMES)  # noqa: E731
+        inside = sorted(p for p in source.iterdir() if p.is_dir() and not p.name.startswith("."))
+        if is_object(source) or not any(is_object(p) for p in inside):
+            folders.append(source)
+        else:
+            folders += [p for p in inside if p.resolve() != out.resolve()]
+    return folders
+
+
+def _key(folder: Path, config: ConvertConfig) -> str:
+    """Hash of all that a conversion depends on."""
+    digest = hashlib.sha256(json.dumps([FORMAT, asdict(config), _versions()], sort_keys=True).encode())
+    for path in sorted(folder.rglob("*")):
+        if path.suffix.lower() in _SOURCE_SUFFIXES and path.is_file():
+            digest.update(str(path.relative_to(folder)).encode())
+            # A link out of the folder is refused later and not read now.
+            if path.resolve().is_relative_to(folder.resolve()):
+                digest.update(hashlib.sha256(path.read_bytes()).digest())
+    return digest.hexdigest()[:32]
+
+
+def _versions() -> dict[str, str]:
+    return {name: version(name) for name in ("vatmart-jax", "numpy", "scipy", "trimesh", "coacd", "mujoco")}
+
+
+def _splits(sources: Sequence[Path]) -> dict[str, str]:
+    """Split by object id, from splits.json in a source folder or beside it."""
+    out: dict[str, str] = {}
+    for source in sources:
+        for folder in (source, source.parent):
+            table = _read_json(folder / "splits.json")
+            for split in SPLITS:
+                for ids in (table.get(split) or {}).values():
+                    out.update({str(i): split for i in ids})
+    return out
+
+
+def default_split(category: str, object_id: str) -> str:
+    """The paper's categories; of the training ones, one object in five (by a hash of its id) is a test shape."""
+    if category in TEST_CATEGORIES:
+        return "test_categories"
+    if category not in TRAIN_CATEGORIES:
+        return "extra"
+    return "test_shapes" if hashlib.sha256(object_id.encode()).digest()[0] % 5 == 0 else "train"
+
+
+def _convert_one(folder: Path, out: Path, config: ConvertConfig, split: str | None, key: str) -> None:
+    """One object folder, complete or not at all."""
+    start = time.monotonic()
+    obj = partnet.read_object(folder, continuous_range=config.continuous_range, allow_missing=config.allow_missing)
+    parts, left_out = partnet.parts(obj)
+    hulls, groups = {}, {}
+    for root in obj.groups:
+        budget = config.static_budget if root == obj.root else config.part_budget
+        visuals = obj.group_visuals(root)
+        hulls[root] = decompose(visuals, budget, config, config.seed)
+        if visuals:
+            match = fidelity(visuals, hulls[root], config.seed)
+            groups[root] = {"hulls": len(hulls[root]), "budget": budget, **asdict(match)}
+    split = split or default_split(obj.category, obj.id)
+    converted = ConvertedObject(obj, hulls, parts, left_out, split)
+    mjcf = to_mjcf(converted, config)
+    try:
+        mjcf.compile()
+    except ObjectError as e:
+        raise ObjectError(f"{obj.id}: {e}") from None
+    report = {
+        "id": obj.id,
+        "category": obj.category,
+        "split": split,
+        "key": key,
+        "parts": [asdict(p) for p in parts],
+        "left_out": [{"joint": j, "reason": why} for j, why in left_out],
+        "notes": obj.notes,
+        "groups": groups,
+        "seconds": round(time.monotonic() - start, 3),
+    }
+    part = out / f".{obj.id}.part"
+    shutil.rmtree(part, ignore_errors=True)
+    try:
+        part.mkdir()
+        mjcf.write(part)
+        converted.save(part)
+        save_png(part / "picture.png", picture(converted))
+        _write_json(part / "report.json", report)
+        shutil.rmtree(out / obj.id, ignore_errors=True)
+        part.rename(out / obj.id)
+    finally:
+        shutil.rmtree(part, ignore_errors=True)
+
+
+def _banks(out: Path, current: dict[str, str], config: ConvertConfig, record: dict[str, Any]) -> None:
+    """scenes.npz, views.npz and splits.json of the current objects, unless they are up to date."""
+
+
+def _pool(
+    function: Callable[..., None], tasks: Sequence[tuple], jobs: int, time_limit: float
+) -> Iterator[tuple[tuple, str | None]]:
+    """Run function(*task) in processes of our own; yields each task with its error, None where it went well.
+
+    Unlike a pool of the standard library it survives a process that dies or hangs: only that task fails.
+    """
+    context = multiprocessing.get_context("spawn")
+    waiting = list(reversed(tasks))
+    busy: dict[Connection, tuple[Any, tuple, float]] = {}
+    idle: list[tuple[Any, Connection]] = []
+    # One thread each: the processes are the parallelism.
+    saved = {k: os.environ.get(k) for k in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")}
+    os.environ.update(dict.fromkeys(saved, "1"))
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn())
+    progress = Progress(*columns, console=Console(stderr=True), transient=True)
+    bar = progress.add_task("Converting", total=len(tasks))
+    try:
+        with progress:
+            while waiting or busy:
+                while waiting and len(busy) < jobs:
+                    if idle:
+                        process, pipe = idle.pop()
+                    else:
+                        pipe, theirs = context.Pipe()
+                        process = context.Process(target=_serve, args=(function, theirs), daemon=True)
+                        process.start()
+                        theirs.close()
+                    task = waiting.pop()
+                    pipe.send(task)
+                    busy[pipe] = process, task, time.monotonic() + time_limit
+                nearest = min(deadline for _, _, deadline in busy.values())
+                ready = wait(list(busy), timeout=max(0.0, nearest - time.monotonic()))
+                for pipe in list(busy):
+                    process, task, deadline = busy[pipe]
+                    if pipe in ready:
+                        try:
+                            error = pipe.recv()
+                            idle.append((process, pipe))
+                        except EOFError:
+                            process.join()
+                            error = f"{task[0].name}: the process died (exit code {process.exitcode})"
+                    elif time.monotonic() > deadline:
+                        process.kill()
+                        process.join()
+                        error = f"{task[0].name}: took longer than {time_limit:g} s; raise --time-limit"
+                    else:
+                        continue
+                    del busy[pipe]
+                    progress.advance(bar)
+                    yield task, error
+    finally:
+        for process, _ in idle:
+            process.kill()
+        for process, _, _ in busy.values():
+            process.kill()
+        for key, value in saved.items():
+            os.environ.pop(key, None) if value is None else os.environ.update({key: value})
+
+
+def _serve(function: Callable[..., None], pipe: Connection) -> None:
+    while True:
+        try:
+            task = pipe.recv()
+        except EOFError:
+            return
+        try:
+            function(*task)
+            pipe.send(None)
+        except ObjectError as e:
+            pipe.send(str(e))
+        except Exception as e:  # whatever one object does, the others go on
+            where = traceback.extract_tb(e.__traceback__)[-1]
+            pipe.send(f"{task[0].name}: {type(e).__name__}: {e} ({Path(where.filename).name}:{where.lineno})")
+
+
+def _read_json(path: Path) -> dict[str, Any]:
+    """{} where the file is missing or broken: it is made again."""
+    try:
+        out = json.loads(path.read_text())
+    except (OSError, ValueError):
+        return {}
+    return out if isinstance(out, dict) else {}
+
+
+def _write_json(path: Path, data: Any) -> None:
+    part = path.with_name(path.name + ".part")
+    part.write_text(json.dumps(data, indent=1))
+    part.replace(path)
