@@ -1,0 +1,135 @@
+"""Procedural objects: they read like PartNet-Mobility's, are deterministic, and open without hitting themselves."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+import yourdfpy
+
+from conversion.partnet import PartNetObject, parts, read_object
+from mjcf_assets.generator import CYCLE, TRAINING, GeneratorError, generate
+
+COUNT = 60
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory) -> Path:
+    out = tmp_path_factory.mktemp("generated")
+    generate(out, COUNT, seed=0)
+    return out
+
+
+@pytest.fixture(scope="module")
+def objects(folder) -> list[PartNetObject]:
+    return [read_object(p) for p in sorted(folder.glob("9*"))]
+
+
+def test_every_category_has_objects_and_training_categories_have_test_shapes(folder):
+    splits = json.loads((folder / "splits.json").read_text())
+    assert set(splits["train"]) == set(splits["test_shapes"]) == set(TRAINING)
+    assert set(splits["test_categories"]) == set(CYCLE) - set(TRAINING)
+    ids = [i for split in splits.values() for group in split.values() for i in group]
+    assert sorted(ids) == sorted(p.name for p in folder.glob("9*")) and len(set(ids)) == COUNT
+
+
+def test_folders_hold_the_files_of_a_real_one(folder):
+    for path in folder.glob("9*"):
+        names = {p.name for p in path.iterdir()}
+        assert names == {
+            "mobility.urdf", "textured_objs", "semantics.txt", "meta.json", "mobility_v2.json", "bounding_box.json",
+        }  # fmt: skip
+        urdf = yourdfpy.URDF.load(str(path / "mobility.urdf"), load_meshes=False)
+        links = [line.split()[0] for line in (path / "semantics.txt").read_text().splitlines()]
+        assert links == [link.name for link in urdf.robot.links][1:]
+        nodes = json.loads((path / "mobility_v2.json").read_text())
+        assert [f"link_{n['id']}" for n in nodes] == links
+        used = {v.geometry.mesh.filename for link in urdf.robot.links for v in link.visuals}
+        assert used == {f"textured_objs/{p.name}" for p in (path / "textured_objs").iterdir()}
+
+
+def test_object_depends_on_seed_and_index_alone(folder, tmp_path):
+    """The same bytes in a shorter run, others with another seed."""
+    ids = generate(tmp_path / "a", 5, seed=0)
+    for name in ids:
+        for file in (tmp_path / "a" / name).rglob("*.*"):
+            assert file.read_bytes() == (folder / name / file.relative_to(tmp_path / "a" / name)).read_bytes()
+    other = generate(tmp_path / "b", 1, seed=1)[0]
+    text = (tmp_path / "b" / other / "mobility.urdf").read_text()
+    assert text.split("\n", 2)[2] != (folder / ids[0] / "mobility.urdf").read_text().split("\n", 2)[2]
+
+
+def test_every_object_has_the_doors_and_drawers_it_says(folder, objects):
+    for obj in objects:
+        lines = (folder / obj.id / "semantics.txt").read_text().splitlines()
+        expected = {x.split()[0] for x in lines if x.split()[2] in ("door", "rotation_door", "drawer")}
+        found, _ = parts(obj)
+        assert {p.link for p in found} == expected and expected
+        assert all(p.closed == 0 and p.sign == 1 for p in found)
+
+
+def test_fronts_face_the_camera_and_open_towards_it(objects):
+    """The object frame's front is -x: what opens comes forward, or for the lids of washing machines, up."""
+    for obj in objects:
+        for part in parts(obj)[0]:
+            vertices = np.concatenate([v.vertices for v in obj.links[part.link].visuals])
+            middle = np.append(vertices.mean(0), 1)
+            closed, ajar = (
+                (obj.link_poses({part.joint: part.closed + part.sign * q})[part.link] @ middle)[:3] for q in (0.0, 0.1)
+            )
+            moved = ajar - closed
+            assert moved[0] < 0 or (obj.category == "WashingMachine" and moved[2] > 0)
+
+
+def test_objects_fill_about_a_unit_sphere(objects):
+    for obj in objects:
+        poses = obj.link_poses()
+        points = np.concatenate(
+            [v.vertices @ poses[k][:3, :3].T + poses[k][:3, 3] for k, x in obj.links.items() for v in x.visuals]
+        )
+        size = np.ptp(points, axis=0)
+        assert 1.95 < np.linalg.norm(size) < 2.1 and 1.0 < size.max() < 2.0
+        assert np.abs((points.min(0) + points.max(0)) / 2).max() < 0.1
+
+
+def test_meshes_are_closed_and_wound_outwards(folder):
+    for path in sorted(folder.glob("9*"))[:10]:
+        for file in (path / "textured_objs").iterdir():
+            mesh = trimesh.load(file, process=True)
+            assert isinstance(mesh, trimesh.Trimesh) and mesh.is_watertight and mesh.volume > 0, file
+
+
+def test_parts_swing_free(objects):
+    """No vertex of a part enters a leaf of the rest by more than 3 mm, from closed to open."""
+    for obj in objects:
+        for part in parts(obj)[0]:
+            moving = set(obj.subtree(part.link))
+            for share in (0.0, 0.1, 0.5, 1.0):
+                poses = obj.link_poses({part.joint: part.closed + part.sign * share * part.width})
+                at = lambda k, v, poses=poses: v.vertices @ poses[k][:3, :3].T + poses[k][:3, 3]  # noqa: E731
+                points = np.concatenate([at(k, v) for k in moving for v in obj.links[k].visuals])
+                for k, link in obj.links.items():
+                    for v in link.visuals if k not in moving else ():
+                        mesh = trimesh.Trimesh(at(k, v), v.faces, process=False)
+                        near = points[((points > mesh.bounds[0]) & (points < mesh.bounds[1])).all(1)]
+                        inside = near[mesh.contains(near)] if len(near) else near
+                        depth = trimesh.proximity.closest_point(mesh, inside)[1] if len(inside) else np.zeros(1)
+                        assert depth.max() < 3e-3, (obj.id, part.link, share, k, v.name)
+
+
+@pytest.mark.parametrize(("count", "seed"), [(0, 0), (100_000, 0), (3, -1)])
+def test_arguments_out_of_range_are_refused(tmp_path, count, seed):
+    with pytest.raises(GeneratorError, match=f"--count {count} --seed {seed}: expected"):
+        generate(tmp_path / "out", count, seed)
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_folder_of_other_objects_is_left_alone(tmp_path):
+    (tmp_path / "45194").mkdir()
+    (tmp_path / "45194" / "mobility.urdf").write_text("")
+    with pytest.raises(GeneratorError, match=r"holds other objects \(45194"):
+        generate(tmp_path, 2, 0)
+    assert [p.name for p in tmp_path.iterdir()] == ["45194"]
