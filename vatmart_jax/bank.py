@@ -20,11 +20,13 @@ import jax.numpy as jnp
 import numpy as np
 from flax import struct
 
+from vatmart_jax.errors import UserError
+
 HINGE, SLIDE = 0, 1
 FORMAT = 1
 
 
-class BankError(ValueError):
+class BankError(UserError):
     """A bank file is missing, truncated or not what it should be."""
 
 
@@ -200,7 +202,7 @@ def _load(path: Path | str, kind: str, names: list[str]) -> dict:
             if str(f["kind"]) != kind or int(f["format"]) != FORMAT:
                 raise BankError(f"{path}: not a {kind} bank of format {FORMAT}; make it again with `vatmart convert`")
             return {name: f[name] for name in names}
-    except (OSError, EOFError, KeyError, ValueError, zipfile.BadZipFile) as e:
+    except (OSError, EOFError, KeyError, TypeError, ValueError, zipfile.BadZipFile) as e:  # TypeError: a .npy file
         if isinstance(e, BankError):
             raise
         raise BankError(f"{path}: damaged ({e}); make it again with `vatmart convert`") from e

@@ -37,9 +37,10 @@ class Task:
     opening: bool  # pull, or push
     low: float  # smallest amount, rad or unit lengths
     high: float
+    shift: float  # tasks of the scorer's negatives are off by up to this much
 
 
-_DOOR, _DRAWER = (np.radians(10).item(), np.radians(70).item()), (0.1, 0.7)
+_DOOR, _DRAWER = (np.radians(10).item(), np.radians(70).item(), np.radians(45).item()), (0.1, 0.7, 0.45)
 TASKS = {
     task.name: task
     for task in (
@@ -251,9 +252,10 @@ class Env:
         obs, distance = self._observe(state)
         return state.replace(obs=obs, info={**state.info, "tip_distance": distance})
 
-    def step(self, state: EnvState, action: jax.Array) -> EnvState:
+    def step(self, state: EnvState, action: jax.Array, abandon: bool = True) -> EnvState:
         """One waypoint from an action [B, 6] in [-1, 1]: move of the fingertips and turn (rotation vector) of the
-        hand, both in the joint-local frame. Trials that are done stay as they are.
+        hand, both in the joint-local frame. Trials that are done stay as they are; one is done when it succeeds,
+        after four waypoints and, with `abandon`, once it cannot succeed any more (lost grip, unsound physics).
         """
         config = self.config
         move = g.rotate(state.frame, action[:, :3] * config.move_range)
@@ -264,17 +266,23 @@ class Env:
         angle = jnp.linalg.norm(vector, axis=-1, keepdims=True)
         vector = vector * jnp.minimum(1.0, config.turn_limit / jnp.maximum(angle, 1e-6))
         euler = g.euler_from_matrix(into @ g.matrix_from_rotvec(vector) @ into.swapaxes(-1, -2))
-        return self._advance(state, jnp.concatenate([move, euler - state.euler], -1), stop_at_success=True)
+        residual = jnp.concatenate([move, euler - state.euler], -1)
+        state = self._advance(state, residual)
+        lost = ~(state.valid & state.held) & abandon
+        return state.replace(done=state.done | state.success | lost)
 
     def execute(self, start: Start, residuals: jax.Array) -> EnvState:
-        """Whole trials, open loop, never stopped early: residuals [B, 4, 6] as `geometry.pack_trajectory` has them."""
+        """Whole trials, open loop, never stopped early: residuals [B, 4, 6] as `geometry.pack_trajectory` has them.
+
+        Starts in collision are failures and not simulated.
+        """
 
         def waypoint(state, residual):
-            return self._advance(state, residual, stop_at_success=False), None
+            return self._advance(state, residual), None
 
         return jax.lax.scan(waypoint, self.begin(start), residuals.swapaxes(0, 1))[0]
 
-    def _advance(self, state: EnvState, residual: jax.Array, stop_at_success: bool) -> EnvState:
+    def _advance(self, state: EnvState, residual: jax.Array) -> EnvState:
         active = ~state.done
         residual = jnp.where(active[:, None], residual, 0.0)
         tip, euler = state.tip + residual[:, :3], state.euler + residual[:, 3:]
@@ -287,7 +295,6 @@ class Env:
         task = state.start.task
         success = valid & held & (jnp.abs(task - moved) <= self.config.tolerance * task)
         waypoint = state.waypoint + 1
-        over = (waypoint >= g.WAYPOINTS) | ~valid | ~held
         state = state.replace(
             physics=physics,
             ctrl=jnp.where(active[:, None], ctrl, state.ctrl),
@@ -299,7 +306,7 @@ class Env:
             held=held,
             valid=valid,
             success=success,
-            done=state.done | over | (success if stop_at_success else False),
+            done=state.done | (waypoint >= g.WAYPOINTS),
             info={**state.info, "moved": moved},
         )
         obs, distance = self._observe(state)

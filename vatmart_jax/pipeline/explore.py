@@ -50,8 +50,8 @@ class Explorer:
         self.env, self.config = env, config
         self.td3 = TD3(config.td3, OBSERVATION, ACTION)
         self.iterate = jax.jit(self._iterate)
-        self.run = jax.jit(self._run)
-        self._begin = jax.jit(lambda key: env.begin(env.sample(key, env.config.batch)))
+        self.run = jax.jit(self._run, static_argnames="abandon")
+        self.random_starts = jax.jit(env.reset)
 
     def init(self, key: jax.Array) -> ExploreState:
         """Consumes the key."""
@@ -59,24 +59,28 @@ class Explorer:
         replay = Replay.create(self.config.td3.capacity, OBSERVATION, ACTION)
         return ExploreState(self.td3.init(kt), replay, ks, jnp.zeros((), jnp.int32))
 
-    def random_starts(self, key: jax.Array) -> EnvState:
-        """A batch of random starts as they are, colliding ones and failed grasps included. Consumes the key."""
-        return self._begin(key)
+    def _run(
+        self, policy, pool: Start | None, key: jax.Array, noise, random, abandon: bool = True
+    ) -> tuple[EnvState, Episode]:
+        """One batch of trials; from the pool if there is one, else from random starts. Consumes the key.
 
-    def _run(self, policy, pool: Start | None, key: jax.Array, noise, random) -> tuple[EnvState, Episode]:
-        """One batch of trials; from the pool if there is one, else from random starts. Consumes the key."""
+        Without `abandon` the policy acts out trials that cannot succeed too: perception learns from them.
+        """
         kr, ke = jax.random.split(key)
+        begun = self.env.reset(kr, pool)
+        if not abandon:
+            begun = begun.replace(done=jnp.zeros_like(begun.done))
 
         def step(state: EnvState, key: jax.Array):
             action = self.td3.explore(policy, state.obs, key, noise, random)
-            after = self.env.step(state, action)
+            after = self.env.step(state, action, abandon)
             record = Episode(
                 state.obs, action, after.reward, after.obs, after.done, ~state.done,
                 state.moved, after.moved, after.info["tip_distance"], after.held,
             )  # fmt: skip
             return after, record
 
-        return jax.lax.scan(step, self.env.reset(kr, pool), jax.random.split(ke, g.WAYPOINTS))
+        return jax.lax.scan(step, begun, jax.random.split(ke, g.WAYPOINTS))
 
     def _iterate(self, state: ExploreState, pool: Start, curiosity) -> tuple[ExploreState, EnvState, dict]:
         """Trials, storing, hindsight, updates.

@@ -1,0 +1,74 @@
+"""Where training data comes from: a converted folder, a folder of objects, or the bundled generated objects."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+
+from vatmart_jax import __version__
+from vatmart_jax.bank import SceneBank, ViewBank
+from vatmart_jax.env import Env, EnvConfig, Task
+from vatmart_jax.errors import UserError
+from vatmart_jax.physics import PhysicsConfig
+
+BUNDLED_COUNT, BUNDLED_SEED = 60, 0
+SPLITS = ("train", "test_shapes", "test_categories")
+
+
+class DataError(UserError):
+    """A data folder cannot be used."""
+
+
+def cache_folder() -> Path:
+    """Where generated objects, conversions and compiled programs are kept between runs."""
+    base = os.environ.get("XDG_CACHE_HOME") or str(Path.home() / ".cache")
+    return Path(base) / "vatmart_jax"
+
+
+def prepare(data: Path | None, convert: Callable[[Path, Path], None], generate: Callable[[Path], None]) -> Path:
+    """The converted folder (scenes.npz, views.npz) for `data`, made in the cache where it does not exist yet.
+
+    data: a converted folder, a folder of PartNet-Mobility objects, or None for the bundled objects.
+    convert(source, out) and generate(out) do the work. Raises DataError where `data` is neither.
+    """
+    if data is None:
+        objects = cache_folder() / f"objects-{__version__}-{BUNDLED_COUNT}-{BUNDLED_SEED}"
+        generate(objects)
+        data = objects
+    elif not data.is_dir():
+        raise DataError(f"{data}: no such folder; --data takes a folder of objects or what `vatmart convert` made of it")
+    if (data / "scenes.npz").is_file():
+        return data
+    if (data / "mobility.urdf").is_file() or not any(data.glob("*/mobility*.urdf")):
+        raise DataError(
+            f"{data}: holds neither scenes.npz nor object folders with a mobility.urdf; "
+            "--data takes a folder of objects or what `vatmart convert` made of it"
+        )
+    name = hashlib.sha256(str(data.resolve()).encode()).hexdigest()[:16]
+    out = cache_folder() / "converted" / name
+    convert(data, out)
+    return out
+
+
+class Data:
+    """The banks of one converted folder."""
+
+    def __init__(self, folder: Path):
+        """Raises BankError where the banks are missing or damaged."""
+        self.folder = folder
+        self._scenes = SceneBank.load(folder / "scenes.npz")
+        self._views = ViewBank.load(folder / "views.npz")
+
+    def env(self, split: str, task: Task, impl: str, config: EnvConfig, physics: PhysicsConfig) -> Env:
+        """The environment of one split. Raises DataError where the split has nothing for the task."""
+        chosen = np.flatnonzero(self._scenes.split == split)
+        if len(chosen) == 0:
+            raise DataError(f"{self.folder}: has no object of the split {split}; see splits.json")
+        try:
+            return Env(self._scenes.select(chosen), self._views.of_scenes(chosen), task, impl, config, physics)
+        except ValueError as e:
+            raise DataError(f"{self.folder}, split {split}: {e}") from e

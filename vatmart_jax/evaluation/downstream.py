@@ -1,0 +1,73 @@
+"""Downstream manipulation: what the priors choose is executed, open loop, on objects they have not seen.
+
+Strict: success is the part's value at the END of the trajectory within tolerance; a start in collision or a lost grip
+is a failure; nothing leaves the denominator. The released code's looser definition (it stops at the first waypoint
+within tolerance) is reported beside it as `success_any_waypoint`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from vatmart_jax import geometry as g
+from vatmart_jax.env import Env, EnvState, Start
+from vatmart_jax.evaluation.metrics import wilson_interval
+
+Method = Callable[[Start, jax.Array], EnvState]  # views and tasks (contact and rotation may be replaced), key
+
+
+def random_method(env: Env) -> Method:
+    """Random contact on the part, random approach within the cone, residuals uniform in the action range."""
+    limits = jnp.array([env.config.move_range] * 3 + [env.config.turn_range] * 3)
+
+    @jax.jit
+    def run(start: Start, key: jax.Array) -> EnvState:
+        kc, kr, kn, ka = jax.random.split(key, 4)
+        n = len(start.view)
+        contact = jax.random.randint(kc, (n,), 0, env.views.contacts.shape[1])
+        normal = jnp.asarray(env.views.contact_normals)[start.view, contact]
+        up = g.cone_direction(ka, -normal, env.config.cone)
+        rotation = g.gripper_frame(up, jax.random.normal(kn, up.shape))
+        residuals = jax.random.uniform(kr, (n, g.WAYPOINTS, 6), minval=-1.0) * limits
+        return env.execute(start.replace(contact=contact, rotation=rotation), residuals)
+
+    return run
+
+
+def downstream(
+    env: Env, method: Method, trials: int, key: jax.Array, progress: Callable[[int], None] = lambda done: None
+) -> dict[str, float | int | list[float]]:
+    """Success of a method over `trials` random views and tasks; the same ones for every method with the same key.
+
+    Consumes the key.
+    """
+    sample = jax.jit(lambda key: env.sample(key, env.config.batch))
+    rows: list[dict[str, np.ndarray]] = []
+    for batch in range(-(-trials // env.config.batch)):
+        ks, km = jax.random.split(jax.random.fold_in(key, batch))
+        final = method(sample(ks), km)
+        task = final.start.task
+        within = jnp.abs(final.progress - task[:, None]) <= env.config.tolerance * task[:, None]
+        outcome = {
+            "success": final.success,
+            "success_any_waypoint": final.valid & within.any(1),
+            "in_collision": final.in_collision,
+            "lost_grip": ~final.in_collision & ~final.held,
+            "diverged": final.physics.diverged,
+            "scene": final.physics.scene,
+        }
+        rows.append(jax.device_get(outcome))
+        progress(min(trials, (batch + 1) * env.config.batch))
+    joined = {name: np.concatenate([row[name] for row in rows])[:trials] for name in rows[0]}
+    scenes = joined.pop("scene")
+    per_object = {
+        str(name): round(float(joined["success"][env.bank.object_id[scenes] == name].mean()), 3)
+        for name in np.unique(env.bank.object_id[scenes])
+    }
+    rates = {name: float(value.mean()) for name, value in joined.items()}
+    interval = [float(x) for x in wilson_interval(int(joined["success"].sum()), trials)]
+    return {"trials": trials, "ci95": interval, **rates, "per_object": per_object}

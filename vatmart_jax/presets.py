@@ -1,0 +1,104 @@
+"""Settings of a training run, and the presets: quick, cpu, gpu, paper. They share one code path."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+
+from vatmart_jax.env import EnvConfig
+from vatmart_jax.perception.networks import NetworksConfig
+from vatmart_jax.perception.pointnet2 import SMALL
+from vatmart_jax.perception.train import PerceptionConfig
+from vatmart_jax.physics import PhysicsConfig
+from vatmart_jax.pipeline.explore import ExploreConfig
+from vatmart_jax.rl.td3 import TD3Config
+
+
+@dataclass(frozen=True)
+class Schedule:
+    """How much of every stage after exploration. Steps are gradient steps of the perception networks."""
+
+    samples: int = 65_536
+    """capacity of the sample buffer; the oldest give way"""
+    late_share: float = 0.5
+    """exploration's trials from this share of its iterations on are samples too: policies of several ages"""
+    collect: int = 32
+    """batches of trials by the finished policy from random starts, failures included"""
+    collect_noise: float = 0.05
+    scorer: int = 600
+    proposal: int = 600
+    actionability: int = 150
+    curiosity: int = 4
+    """rounds of curiosity: exploration with the penalty, then perception on what it found"""
+    curiosity_iterations: int = 3
+    curiosity_steps: int = 50
+    curiosity_weight: float = 500.0
+    """penalty for a successful trajectory the scorer is sure of; the paper's 500"""
+    finetune: int = 3
+    """rounds of labelling the networks' own proposals in simulation and training on them jointly"""
+    finetune_batches: int = 6
+    finetune_steps: int = 250
+    finetune_rate: float = 5e-4
+    """learning rate of curiosity and finetune rounds"""
+
+
+@dataclass(frozen=True)
+class EvaluationConfig:
+    """The evaluation at the end of a run."""
+
+    trials: int = 350
+    """per split, as in the paper"""
+    proposals: int = 100
+
+
+@dataclass(frozen=True)
+class Settings:
+    """Everything that a preset decides."""
+
+    env: EnvConfig = field(default_factory=EnvConfig)
+    physics: PhysicsConfig = field(default_factory=PhysicsConfig)
+    explore: ExploreConfig = field(default_factory=ExploreConfig)
+    perception: PerceptionConfig = field(default_factory=PerceptionConfig)
+    schedule: Schedule = field(default_factory=Schedule)
+    evaluation: EvaluationConfig = field(default_factory=EvaluationConfig)
+
+
+PRESETS = {
+    "quick": Settings(
+        explore=ExploreConfig(iterations=60, pool=2048),
+        perception=PerceptionConfig(networks=NetworksConfig(pointnet=SMALL), proposals=32),
+    ),
+    "cpu": Settings(
+        env=EnvConfig(batch=512),
+        explore=ExploreConfig(iterations=300, pool=16384),
+        perception=PerceptionConfig(networks=NetworksConfig(pointnet=SMALL)),
+        schedule=Schedule(
+            samples=400_000, collect=100, scorer=4000, proposal=4000, actionability=1000, curiosity=20,
+            curiosity_steps=100, finetune=8, finetune_batches=30, finetune_steps=1500,
+        ),
+    ),
+    "gpu": Settings(
+        env=EnvConfig(batch=4096),
+        explore=ExploreConfig(iterations=300, pool=65536, td3=TD3Config(batch=1024, capacity=1_000_000)),
+        perception=PerceptionConfig(views=32),
+        schedule=Schedule(
+            samples=2_000_000, collect=100, scorer=10_000, proposal=10_000, actionability=3000, curiosity=30,
+            curiosity_steps=200, finetune=10, finetune_batches=20, finetune_steps=3000,
+        ),
+    ),
+    # The paper's numbers where it gives them (appendix A, B): 5,000 episodes and 5,000 + 5,000 trajectories.
+    "paper": Settings(
+        env=EnvConfig(batch=64),
+        explore=ExploreConfig(
+            iterations=5000,
+            td3=TD3Config(batch=512, learning_rate=1e-4, capacity=2048, policy_delay=3, updates=6),
+            noise=(0.1, 0.1 / 2**10),
+        ),
+        perception=PerceptionConfig(
+            networks=replace(NetworksConfig(), separate=True), views=8, queries=4, probes=4, mirror=False
+        ),
+        schedule=Schedule(
+            samples=20_000, collect=160, scorer=16_000, proposal=35_000, actionability=5000, curiosity=1500,
+            curiosity_iterations=1, curiosity_steps=1, finetune=0,
+        ),
+    ),
+}  # fmt: skip
