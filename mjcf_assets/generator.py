@@ -108,8 +108,7 @@ def fill(
 
 def column(rng: np.random.Generator, width: float, height: float, drawers: float) -> list[tuple[str, float]]:
     """What is stacked in one column, from above: (kind, height). drawers: how likely drawers are."""
-    leaf = lambda h: "pair" if width > 0.8 or (width > 0.6 and rng.random() < 0.5) else "door"  # noqa: E731
-    wide = lambda h: width / h > 1.5  # noqa: E731
+    leaf = lambda: "pair" if width > 0.8 or (width > 0.6 and rng.random() < 0.5) else "door"  # noqa: E731
     if rng.random() < drawers * 0.55:
         n = int(np.clip(rng.integers(1, 5), np.ceil(height / 0.5), max(height / 0.14, 1)))
         share = np.linspace(1, rng.choice([1.0, 1.0, 1.8]), n)
@@ -118,24 +117,27 @@ def column(rng: np.random.Generator, width: float, height: float, drawers: float
         h = float(np.clip(height * rng.uniform(0.15, 0.35), 0.13, 0.4))
         middle = [("open", 0.25 * height)] if height > 0.8 and rng.random() < 0.3 else []
         rest = height - h - sum(x for _, x in middle)
-        rows = [("drawer", h), *middle, (leaf(rest), rest)]
+        rows = [("drawer", h), *middle, (leaf(), rest)]
         return rows[::-1] if rng.random() < 0.25 else rows
-    if wide(height):
+    if width / height > 1.5:
         n = 2 if height > 0.5 and rng.random() < 0.4 else 1
         kinds = [str(rng.choice(["flip", "drop", "pair", "door"], p=[0.25, 0.2, 0.3, 0.25])) for _ in range(n)]
-        return [(k if width / (height / n) > 1.2 else leaf(height), height / n) for k in kinds]
+        return [(k if width / (height / n) > 1.2 else leaf(), height / n) for k in kinds]
     if height > 1.2 and rng.random() < 0.6:
         h = height * rng.uniform(0.3, 0.7)
-        other = str(rng.choice(["open", leaf(h), leaf(h)]))
-        return [(leaf(h), height - h), (other, h)]
-    return [(leaf(height), height)]
+        other = str(rng.choice(["open", leaf(), leaf()]))
+        return [(leaf(), height - h), (other, h)]
+    return [(leaf(), height)]
 
 
 def cabinet(
     rng: np.random.Generator, s: Style, body: Link, r: Rect, back: float, z: float, columns: int, drawers: float,
-    top: bool = True,
+    top: bool = True, free: tuple[bool, bool] = (True, True),
 ) -> list[Link]:  # fmt: skip
-    """A carcass in r, cut into columns and rows, furnished with at least one moving part."""
+    """A carcass in r, cut into columns and rows, furnished with at least one moving part.
+
+    drawers: how likely they are. free: nothing stands beside it on the left, on the right.
+    """
     t = s.board
     carcass(body, r, back, z, t, top)
     share = np.ones(columns) if rng.random() < 0.7 else rng.uniform(0.6, 1.4, columns)
@@ -156,7 +158,7 @@ def cabinet(
             cell = Rect(x[c], y - h, x[c + 1], y)
             left, right = c == 0, c == columns - 1
             edges = (t if left else t / 2, t if last else t / 2, t if right else t / 2, t if first else t / 2)
-            links += fill(rng, s, body, cell, edges, kind, back + 0.5 * t, z, (left, right))
+            links += fill(rng, s, body, cell, edges, kind, back + 0.5 * t, z, (left and free[0], right and free[1]))
             if not last and not (kind == plan[k + 1][0] == "drawer" and rng.random() < 0.5):
                 rail = Rect(x[c], y - h - t / 2, x[c + 1], y - h + t / 2).shrink(t / 2, 0)
                 body.add("frame_horizontal_bar", board(rail, back + 0.5 * t, z))
@@ -254,7 +256,8 @@ def table(rng: np.random.Generator) -> list[Link]:
     for side in ("left", "right"):
         x = under.x0 if side == "left" else under.x1 - width
         if side in sides:
-            links += cabinet(rng, s, body, Rect(x, low, x + width, ceiling), under.y0, under.y1, 1, 0.9)
+            room, free = Rect(x, low, x + width, ceiling), (side == "left", side == "right")
+            links += cabinet(rng, s, body, room, under.y0, under.y1, 1, 0.9, free=free)
             if low:
                 body.add("leg", *feet(rng, style, Rect(x, under.y0, x + width, under.y1), 0, low, min(leg, 0.06)))
         elif rng.random() < 0.5:
@@ -263,15 +266,15 @@ def table(rng: np.random.Generator) -> list[Link]:
         else:
             x = under.x0 if side == "left" else under.x1 - 2 * leg
             body.add("leg", *feet(rng, style, Rect(x, under.y0, x + 2 * leg, under.y1), 0, ceiling, leg)[::2])
-    free = Rect(
+    knees = Rect(
         under.x0 + (width if "left" in sides else 2 * leg), ceiling - rng.uniform(0.12, 0.2),
         under.x1 - (width if "right" in sides else 2 * leg), ceiling,
     )  # fmt: skip
     if rng.random() < 0.6:
         low = ceiling - rng.uniform(0.3, 0.8) * ceiling
-        body.add("back_panel", box((free.x0, low, under.y0), (free.x1, ceiling, under.y0 + 0.02)))
+        body.add("back_panel", box((knees.x0, low, under.y0), (knees.x1, ceiling, under.y0 + 0.02)))
     if rng.random() < 0.35:
-        links += cabinet(rng, s, body, free, under.y0 + 0.03, under.y1, 1, 100.0)
+        links += cabinet(rng, s, body, knees, under.y0 + 0.03, under.y1, 1, 100.0)
     return [*links, body]
 
 

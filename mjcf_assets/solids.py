@@ -145,7 +145,7 @@ def _pierced(outer: np.ndarray, inner: np.ndarray, axis: int, lo: float, hi: flo
 
 
 def tub(r: Rect, hole: Rect, z0: float, floor: float, z1: float, radius: float = 0.0) -> Mesh:
-    """A block from z0 to z1 with a pocket, open towards +z, down to z = floor."""
+    """A block from z0 to z1 with a pocket, open towards +z, down to z = floor. radius: of its outer edges."""
     outer = rounded(r, radius) if radius else corners(r)
-    inner = rounded(hole, radius / 2) if radius else corners(hole)
+    inner = rounded(hole, 0.004) if radius else corners(hole)
     return loft([place(outer, 2, z0), place(outer, 2, z1), place(inner, 2, z1), place(inner, 2, floor)])
