@@ -148,6 +148,23 @@ def test_a_simulation_that_blows_up_is_marked_and_its_place_is_as_new_afterwards
     assert_bitwise(sound, fresh.rollout(fresh.reset(scene, pose, qpos), doors.controls(), ones))
 
 
+def test_divergence_is_noticed_every_time_and_said_nowhere_else(doors, tmp_path, monkeypatch, capfd):
+    monkeypatch.chdir(tmp_path)
+    scene, pose, qpos = doors.starts()
+    pose[4, 0] = np.nan
+    mine = lambda message: None  # noqa: E731
+    mujoco.set_mju_user_warning(mine)
+    try:
+        for seed in range(3):
+            state = doors.rollout(doors.reset(scene, pose, qpos), doors.controls(seed), np.ones(BATCH, bool))
+            np.testing.assert_array_equal(state.diverged, np.arange(BATCH) == 4)
+        assert mujoco.get_mju_user_warning() is mine
+    finally:
+        mujoco.set_mju_user_warning(None)
+    assert not list(tmp_path.iterdir())
+    assert capfd.readouterr().err == ""
+
+
 def test_ten_rollouts_with_changing_scenes_compile_once(cabinets):
     pushes, traces = Pushes(cabinets, HINGE), 0
 
