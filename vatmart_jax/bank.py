@@ -188,7 +188,7 @@ def _save(path: Path | str, kind: str, arrays: dict[str, np.ndarray | str]) -> N
     part = path.with_name(path.name + ".part")
     try:
         with part.open("wb") as f:
-            np.savez(f, format=np.int32(FORMAT), kind=np.array(kind), **{k: np.asarray(v) for k, v in arrays.items()})
+            np.savez(f, **{"format": np.int32(FORMAT), "kind": np.array(kind), **arrays})  # pyright: ignore[reportArgumentType]
         part.replace(path)
     finally:
         part.unlink(missing_ok=True)

@@ -107,9 +107,9 @@ def _train(argv: list[str]) -> None:
     """Train priors for one task: all stages, resumable."""
     from vatmart_jax.presets import PRESETS, Settings
 
-    preset = _peek(argv, "--preset") or "quick"
-    if preset not in PRESETS:
-        raise UserError(f"--preset {preset}: not one of {', '.join(PRESETS)}")
+    chosen = _peek(argv, "--preset") or "quick"
+    if chosen not in PRESETS:
+        raise UserError(f"--preset {chosen}: not one of {', '.join(PRESETS)}")
 
     @dataclass(frozen=True)
     class Train:
@@ -124,24 +124,24 @@ def _train(argv: list[str]) -> None:
         """run folder"""
         data: Path | None = None
         """a folder of objects, or what `vatmart convert` made of it; default the bundled objects"""
-        preset: str = preset
+        preset: str = chosen
         """quick, cpu, gpu or paper; the flags below start from it"""
         impl: str = "c"
         """physics"""
         seed: int = 0
         json: _Json = False
-        settings: Annotated[Settings, arg(name="")] = field(default_factory=lambda: PRESETS[preset])
+        settings: Annotated[Settings, arg(name="")] = field(default_factory=lambda: PRESETS[chosen])
 
     args = tyro.cli(Train, args=argv, prog="vatmart train")
     _enable_compilation_cache()
-    from vatmart_jax.pipeline.main import train
+    from vatmart_jax.pipeline.run import check_folder
     from vatmart_jax.progress import Bars
+    from vatmart_jax.training import resolve, train
 
+    config = resolve(args.task, args.preset, args.impl, args.seed, args.settings, args.data)
+    check_folder(args.out, config)
     with Bars() as bars:
-        folder = _prepared(args.data, bars.say)
-        result, table = train(
-            args.task, folder, args.out, args.preset, args.impl, args.seed, args.settings, args.data, bars
-        )
+        result, table = train(config, args.settings, _prepared(args.data, bars.say), args.out, bars)
     _print_result(result, args.json, table)
 
 

@@ -19,6 +19,9 @@ BUNDLED_COUNT, BUNDLED_SEED = 60, 0
 SPLITS = ("train", "test_shapes", "test_categories")
 
 
+_WANTED = "--data takes a folder of objects or what `vatmart convert` made of it"
+
+
 class DataError(UserError):
     """A data folder cannot be used."""
 
@@ -40,14 +43,11 @@ def prepare(data: Path | None, convert: Callable[[Path, Path], None], generate: 
         generate(objects)
         data = objects
     elif not data.is_dir():
-        raise DataError(f"{data}: no such folder; --data takes a folder of objects or what `vatmart convert` made of it")
+        raise DataError(f"{data}: no such folder; {_WANTED}")
     if (data / "scenes.npz").is_file():
         return data
     if (data / "mobility.urdf").is_file() or not any(data.glob("*/mobility*.urdf")):
-        raise DataError(
-            f"{data}: holds neither scenes.npz nor object folders with a mobility.urdf; "
-            "--data takes a folder of objects or what `vatmart convert` made of it"
-        )
+        raise DataError(f"{data}: holds neither scenes.npz nor object folders with a mobility.urdf; {_WANTED}")
     name = hashlib.sha256(str(data.resolve()).encode()).hexdigest()[:16]
     out = cache_folder() / "converted" / name
     convert(data, out)

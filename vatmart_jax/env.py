@@ -394,7 +394,7 @@ class Env:
 
 
 def reward_terms(task, before, after, distance, success) -> dict[str, jax.Array]:
-    """The paper's extrinsic reward, term by term (section 4.1). All arguments [B]; distance from fingertip to contact."""
+    """The paper's extrinsic reward, term by term (section 4.1). All [B]; distance is from fingertips to contact."""
     return {
         "guidance": 300.0 * (jnp.abs(task - before) - jnp.abs(task - after)),
         "distance": -150.0 * distance,
@@ -404,7 +404,7 @@ def reward_terms(task, before, after, distance, success) -> dict[str, jax.Array]
 
 
 def _promising(bank: SceneBank, views: ViewBank, task: Task) -> np.ndarray:
-    """[V, C] bool: contacts on handles (pull), or on faces that point against the part's motion, off its axis (push)."""
+    """[V, C] bool: contacts on handles (pull), or on faces against the part's motion and off its axis (push)."""
     if task.opening:
         return views.contact_handle
     scenes = Scenes.of(bank)

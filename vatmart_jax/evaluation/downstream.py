@@ -8,6 +8,7 @@ within tolerance) is reported beside it as `success_any_waypoint`.
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -40,7 +41,7 @@ def random_method(env: Env) -> Method:
 
 def downstream(
     env: Env, method: Method, trials: int, key: jax.Array, progress: Callable[[int], None] = lambda done: None
-) -> dict[str, float | int | list[float]]:
+) -> dict[str, Any]:
     """Success of a method over `trials` random views and tasks; the same ones for every method with the same key.
 
     Consumes the key.

@@ -45,9 +45,7 @@ def labelled(explorer: Explorer, policy: Any, count: int, key: jax.Array) -> tup
     wrong = ~np.asarray(shifted.success(tolerance))
     shifted = jax.tree.map(lambda a: a[wrong], shifted)
     half = min(n // 2, len(failed.view))
-    negative = jax.tree.map(
-        lambda a, b: np.concatenate([a[:half], b[: n - half]]), failed, shifted
-    )
+    negative = jax.tree.map(lambda a, b: np.concatenate([a[:half], b[: n - half]]), failed, shifted)
     return jax.tree.map(jnp.asarray, positive), jax.tree.map(jnp.asarray, negative)
 
 

@@ -160,7 +160,7 @@ def _spec(bank: SceneBank, scene: int, slots: tuple[int, int], config: PhysicsCo
                 common |= {"meshname": "parked"} if hull_bank else {"size": [1e-3] * 3}
             else:
                 row = rows[slot]
-                shape = bank.instance_shape[row]
+                shape = int(bank.instance_shape[row])
                 place = {"pos": bank.instance_pos[row], "quat": bank.instance_quat[row], "density": 100}
                 common |= {"meshname": _mesh_name(shape)} if hull_bank else {"size": bank.box_size[shape]}
             kind = mujoco.mjtGeom.mjGEOM_MESH if hull_bank else mujoco.mjtGeom.mjGEOM_BOX

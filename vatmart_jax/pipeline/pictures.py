@@ -12,7 +12,7 @@ import numpy as np
 from vatmart_jax import geometry as g
 
 matplotlib.use("Agg")
-import matplotlib.pyplot as plt  # noqa: E402
+import matplotlib.pyplot as plt
 
 _STAGE_CURVES = (
     ("explore", ("success", "reward")),

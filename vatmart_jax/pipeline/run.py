@@ -30,30 +30,19 @@ class Run:
     def __init__(self, folder: Path, config: dict[str, Any]):
         """Opens or makes the folder. Raises RunError where it holds something else."""
         self.folder = Path(folder)
-        path = self.folder / "config.json"
-        if path.exists():
-            held = _read_json(path)
-            changed = sorted(k for k in held.keys() | config.keys() if held.get(k) != config.get(k))
-            if changed:
-                raise RunError(
-                    f"{self.folder}: holds a run with another config ({', '.join(changed)} differ); "
-                    "choose another --out, or delete it"
-                )
-        elif self.folder.exists() and any(self.folder.iterdir()):
-            raise RunError(f"{self.folder}: is not empty and holds no run (no config.json); choose another --out")
-        else:
-            self.folder.mkdir(parents=True, exist_ok=True)
-            write_json(path, config)
+        check_folder(self.folder, config)
+        self.folder.mkdir(parents=True, exist_ok=True)
+        write_json(self.folder / "config.json", config)
         # Orbax writes to a temporary name and renames; async saving would hold device buffers that jit may reuse.
         options = ocp.CheckpointManagerOptions(max_to_keep=2, enable_async_checkpointing=False)
         self._checkpoints = ocp.CheckpointManager((self.folder / "checkpoints").absolute(), options=options)
-        self._metrics = self.folder / "metrics.jsonl"
+        self.metrics = self.folder / "metrics.jsonl"
         self._saved_at = time.monotonic()
         self._lines = 0
 
     def log(self, record: dict[str, Any]) -> None:
         """Append one line to metrics.jsonl."""
-        with self._metrics.open("a") as f:
+        with self.metrics.open("a") as f:
             f.write(json.dumps(record) + "\n")
         self._lines += 1
 
@@ -90,24 +79,47 @@ class Run:
         self._truncate(0)
         return state
 
-    def close(self) -> None:
+    def __enter__(self) -> Run:
+        return self
+
+    def __exit__(self, *_: object) -> None:
         self._checkpoints.close()
 
     def _truncate(self, lines: int) -> None:
         self._lines = lines
-        if self._metrics.exists():
-            kept = self._metrics.read_text().splitlines(keepends=True)[:lines]
-            write_text(self._metrics, "".join(kept))
+        if self.metrics.exists():
+            kept = self.metrics.read_text().splitlines(keepends=True)[:lines]
+            write_text(self.metrics, "".join(kept))
+
+
+def check_folder(folder: Path, config: dict[str, Any]) -> None:
+    """Raises RunError where the folder holds something else than a run with this config."""
+    path = folder / "config.json"
+    if path.exists():
+        held = _read_json(path)
+        changed = sorted(k for k in held.keys() | config.keys() if held.get(k) != config.get(k))
+        if changed:
+            raise RunError(
+                f"{folder}: holds a run with another config ({', '.join(changed)} differ); "
+                "choose another --out, or delete it"
+            )
+    elif folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+        raise RunError(f"{folder}: is not an empty folder and holds no run (no config.json); choose another --out")
+
+
+def write_bytes(path: Path, content: bytes) -> None:
+    """Write a file, complete or not at all."""
+    part = path.with_name(path.name + ".part")
+    try:
+        part.write_bytes(content)
+        os.replace(part, path)
+    finally:
+        part.unlink(missing_ok=True)
 
 
 def write_text(path: Path, text: str) -> None:
     """Write a file, complete or not at all."""
-    part = path.with_name(path.name + ".part")
-    try:
-        part.write_text(text)
-        os.replace(part, path)
-    finally:
-        part.unlink(missing_ok=True)
+    write_bytes(path, text.encode())
 
 
 def write_json(path: Path, value: Any) -> None:

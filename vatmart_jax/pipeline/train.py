@@ -158,9 +158,7 @@ class Training:
             done = int(metrics.pop("step"))
             progress = self._tick(progress.replace(perception=state), stage, done, steps, metrics)
 
-        state = perception.train(
-            progress.perception, self.clouds(), progress.samples, self.config, stage, steps, tick
-        )
+        state = perception.train(progress.perception, self.clouds(), progress.samples, self.config, stage, steps, tick)
         return progress.replace(perception=state)
 
     def _round(self, progress: Progress, steps: int) -> tuple[Progress, dict[str, float]]:

@@ -62,13 +62,11 @@ class TD3:
         policy = self._policy.init(kp, obs)
         critics = jax.vmap(lambda k: self._critic.init(k, obs, action))(jax.random.split(kc, 2))
         opt = self._optimizer
-        return TD3State(
-            policy, critics, policy, critics, opt.init(policy), opt.init(critics), jnp.zeros((), jnp.int32)
-        )
+        return TD3State(policy, critics, policy, critics, opt.init(policy), opt.init(critics), jnp.zeros((), jnp.int32))
 
     def act(self, policy: Any, obs: jax.Array) -> jax.Array:
         """[B, 33] -> [B, 6] in [-1, 1]."""
-        return self._policy.apply(policy, obs)
+        return self._policy.apply(policy, obs)  # pyright: ignore[reportReturnType]
 
     def explore(self, policy: Any, obs: jax.Array, key: jax.Array, noise: jax.Array, random: jax.Array) -> jax.Array:
         """Actions with Gaussian noise (share of the range); a share `random` of them uniform. Consumes the key."""
@@ -88,8 +86,12 @@ class TD3:
         state, metrics = jax.lax.scan(update, state, jax.random.split(key, self.config.updates))
         return state, jax.tree.map(jnp.mean, metrics)
 
+    def _value(self, critic: Any, obs: jax.Array, action: jax.Array) -> jax.Array:
+        return self._critic.apply(critic, obs, action)  # pyright: ignore[reportReturnType]
+
     def _values(self, critics: Any, obs: jax.Array, action: jax.Array) -> jax.Array:
-        return jax.vmap(self._critic.apply, (0, None, None))(critics, obs, action)
+        value = lambda critic: self._value(critic, obs, action)  # noqa: E731
+        return jax.vmap(value)(critics)
 
     def _update(self, state: TD3State, steps: Transition, key: jax.Array):
         config = self.config
@@ -111,7 +113,7 @@ class TD3:
             first = jax.tree.map(lambda x: x[0], state.critics)
 
             def policy_loss(policy):
-                return -jnp.mean(self._critic.apply(first, steps.obs, self.act(policy, steps.obs)))
+                return -jnp.mean(self._value(first, steps.obs, self.act(policy, steps.obs)))
 
             grads = jax.grad(policy_loss)(state.policy)
             changes, policy_opt = self._optimizer.update(grads, state.policy_opt)

@@ -1,0 +1,164 @@
+"""A whole training run at toy sizes: same code path as every preset."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import jax
+import numpy as np
+import pytest
+
+from vatmart_jax.config import from_json, to_json
+from vatmart_jax.env import EnvConfig
+from vatmart_jax.errors import UserError
+from vatmart_jax.perception.networks import NetworksConfig
+from vatmart_jax.perception.pointnet2 import Level, PointNetConfig
+from vatmart_jax.perception.train import PerceptionConfig
+from vatmart_jax.physics import PhysicsConfig
+from vatmart_jax.pipeline.explore import ExploreConfig
+from vatmart_jax.pipeline.run import Run, RunError
+from vatmart_jax.presets import PRESETS, EvaluationConfig, Schedule, Settings
+from vatmart_jax.rl.td3 import TD3Config
+from vatmart_jax.training import resolve, train
+
+TINY = Settings(
+    env=EnvConfig(batch=16),
+    physics=PhysicsConfig(steps_per_waypoint=50),
+    explore=ExploreConfig(td3=TD3Config(hidden=32, batch=32, capacity=1000, updates=4), iterations=4, pool=32),
+    perception=PerceptionConfig(
+        networks=NetworksConfig(
+            pointnet=PointNetConfig(64, (Level(16, 0.3, 4, (16,)), Level(4, 0.8, 4, (16,))), ((16,), (16,)), 16)
+        ),
+        views=2, queries=4, probes=2, proposals=4, best=2, steps_per_call=3,
+    ),
+    schedule=Schedule(
+        samples=512, collect=2, scorer=6, proposal=6, actionability=3, curiosity=2, curiosity_iterations=1,
+        curiosity_steps=3, finetune=1, finetune_batches=1, finetune_steps=3,
+    ),
+    evaluation=EvaluationConfig(trials=24, proposals=4),
+)  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def converted(cabinets, tmp_path_factory) -> Path:
+    folder = tmp_path_factory.mktemp("converted")
+    for bank, name in zip(cabinets, ("scenes", "views"), strict=True):
+        bank.save(folder / f"{name}.npz")
+    return folder
+
+
+def run(converted: Path, out: Path, task: str = "push-drawer", seed: int = 0, report=lambda *_: None):
+    config = resolve(task, "quick", "c", seed, TINY, converted)
+    return train(config, TINY, converted, out, report)
+
+
+@pytest.fixture(scope="module")
+def finished(converted, tmp_path_factory) -> tuple[Path, dict]:
+    out = tmp_path_factory.mktemp("runs") / "whole"
+    result, _ = run(converted, out)
+    return out, result
+
+
+def test_a_run_leaves_everything_its_readers_need(finished):
+    out, result = finished
+    for name in ("config.json", "metrics.jsonl", "result.json", "policy.msgpack", "priors", "curves.png"):
+        assert (out / name).exists(), name
+    assert list(out.glob("priors_*.png"))
+    assert not list(out.rglob("*.part"))
+    assert set(result["success"]) == {"test_shapes", "test_categories"}
+    assert {row["method"] for row in result["results"]} == {"ours", "random"}
+    stages = [json.loads(line)["stage"] for line in (out / "metrics.jsonl").read_text().splitlines()]
+    assert list(dict.fromkeys(stages)) == [
+        "explore", "collect", "scorer", "proposal", "actionability", "curiosity", "finetune",
+    ]  # fmt: skip
+
+
+@pytest.mark.parametrize("stage, done", [("explore", 2), ("scorer", 3), ("curiosity", 1)])
+def test_a_run_killed_at_any_stage_resumes_to_the_same_result(finished, converted, tmp_path, monkeypatch, stage, done):
+    class Killed(Exception):
+        pass
+
+    def kill(name, step, *_):
+        if (name, step) == (stage, done):
+            raise Killed
+
+    monkeypatch.setattr("vatmart_jax.pipeline.train._SECONDS_BETWEEN_CHECKPOINTS", 0.0)
+    with pytest.raises(Killed):
+        run(converted, tmp_path / "run", report=kill)
+    resumed, _ = run(converted, tmp_path / "run")
+    whole, result = finished
+    assert resumed["results"] == result["results"]
+    metrics = [
+        [{k: v for k, v in json.loads(line).items() if k != "seconds"} for line in path.read_text().splitlines()]
+        for path in (whole / "metrics.jsonl", tmp_path / "run" / "metrics.jsonl")
+    ]
+    assert metrics[0] == metrics[1]
+
+
+def test_the_same_seed_gives_the_same_rates_and_another_one_does_not(finished, converted, tmp_path):
+    _, result = finished
+    assert run(converted, tmp_path / "again")[0]["results"] == result["results"]
+
+
+def test_a_folder_with_another_config_is_refused(finished, converted):
+    out, _ = finished
+    with pytest.raises(RunError, match=r"another config \(seed differ\); choose another --out"):
+        run(converted, out, seed=1)
+
+
+def test_a_folder_with_something_else_is_refused(converted, tmp_path):
+    (tmp_path / "notes.txt").write_text("mine")
+    with pytest.raises(RunError, match="holds no run"):
+        run(converted, tmp_path)
+
+
+def test_a_damaged_checkpoint_is_passed_over_and_all_damaged_is_an_error(tmp_path):
+    state = {"x": np.arange(5.0), "key": jax.random.key(3)}
+    with Run(tmp_path / "run", {"a": 1}) as opened:
+        opened.save(state)
+        opened.save({**state, "x": 2 * state["x"]})
+    folders = sorted((tmp_path / "run" / "checkpoints").iterdir(), key=lambda p: int(p.name))
+    _damage(folders[-1])
+    with Run(tmp_path / "run", {"a": 1}) as opened:
+        found = opened.restore(state)
+        np.testing.assert_array_equal(found["x"], state["x"])
+        assert jax.random.key_data(found["key"]).tolist() == jax.random.key_data(state["key"]).tolist()
+    _damage(folders[0])
+    with Run(tmp_path / "run", {"a": 1}) as opened, pytest.raises(RunError, match="cannot be read"):
+        opened.restore(state)
+
+
+def _damage(folder: Path) -> None:
+    for path in folder.rglob("*"):
+        if path.is_file():
+            path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+
+
+def test_unknown_names_are_refused_by_name():
+    with pytest.raises(UserError, match="--task push-lid: not one of push-door, pull-door"):
+        resolve("push-lid", "quick", "c", 0, TINY, None)
+    with pytest.raises(UserError, match="--impl x"):
+        resolve("push-door", "quick", "x", 0, TINY, None)
+
+
+def test_a_task_without_objects_is_refused(cabinets, tmp_path):
+    bank, views = cabinets
+    doors = np.flatnonzero(bank.joint_type == 0)
+    bank.select(doors).save(tmp_path / "scenes.npz")
+    views.of_scenes(doors).save(tmp_path / "views.npz")
+    with pytest.raises(UserError, match=r"split train: the data has no drawer \(slide\)"):
+        run(tmp_path, tmp_path / "run")
+    assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.parametrize("name", PRESETS)
+def test_every_preset_survives_json(name):
+    settings = PRESETS[name]
+    assert from_json(Settings, to_json(settings)) == settings
+
+
+def test_json_of_another_shape_is_refused_by_field():
+    value = to_json(replace(TINY))
+    value["env"]["batch"] = "many"
+    with pytest.raises(ValueError, match=r"config\.env\.batch: expected int, found str"):
+        from_json(Settings, value)

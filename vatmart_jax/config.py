@@ -1,0 +1,45 @@
+"""Nested frozen dataclasses from JSON and back: the resolved config beside every result is enough to load it again."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict, fields, is_dataclass
+from typing import Any, TypeVar, get_args, get_origin, get_type_hints
+
+T = TypeVar("T")
+
+
+def to_json(config: Any) -> dict[str, Any]:
+    """A dataclass as JSON has it: tuples are lists."""
+    return json.loads(json.dumps(asdict(config)))
+
+
+def from_json(kind: type[T], value: Any, where: str = "config") -> T:
+    """The dataclass `kind` with the fields of a JSON object; ValueError names the field that does not fit."""
+    if not isinstance(value, dict):
+        raise ValueError(f"{where}: expected an object, found {type(value).__name__}")
+    hints = get_type_hints(kind)
+    names = {f.name for f in fields(kind)}  # pyright: ignore[reportArgumentType]
+    wrong = sorted(names ^ value.keys())
+    if wrong:
+        raise ValueError(f"{where}: fields {', '.join(wrong)} are missing or unknown")
+    return kind(**{name: _parsed(hints[name], value[name], f"{where}.{name}") for name in names})
+
+
+def _parsed(kind: Any, value: Any, where: str) -> Any:
+    if is_dataclass(kind):
+        return from_json(kind, value, where)  # pyright: ignore[reportArgumentType]
+    if get_origin(kind) is tuple:
+        if not isinstance(value, list):
+            raise ValueError(f"{where}: expected a list, found {type(value).__name__}")
+        kinds = get_args(kind)
+        if kinds[-1] is Ellipsis:
+            kinds = kinds[:1] * len(value)
+        if len(kinds) != len(value):
+            raise ValueError(f"{where}: expected {len(kinds)} values, found {len(value)}")
+        return tuple(_parsed(k, v, f"{where}[{i}]") for i, (k, v) in enumerate(zip(kinds, value, strict=True)))
+    if kind is float and type(value) is int:
+        return float(value)
+    if type(value) is not kind:
+        raise ValueError(f"{where}: expected {kind.__name__}, found {type(value).__name__}")
+    return value

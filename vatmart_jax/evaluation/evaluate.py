@@ -1,0 +1,174 @@
+"""`vatmart evaluate`: tables of runs, methods and splits, as JSON and Markdown."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import jax
+from flax import serialization
+
+from vatmart_jax.config import from_json
+from vatmart_jax.data import SPLITS, Data, DataError
+from vatmart_jax.env import TASKS, Env, EnvState, Start
+from vatmart_jax.errors import UserError
+from vatmart_jax.evaluation.downstream import downstream, random_method
+from vatmart_jax.evaluation.priors import labelled, priors_metrics
+from vatmart_jax.inference import Priors
+from vatmart_jax.perception.train import clouds_of
+from vatmart_jax.pipeline.collect import ProposalTrials
+from vatmart_jax.pipeline.explore import Explorer
+from vatmart_jax.pipeline.run import read_config, write_json, write_text
+from vatmart_jax.presets import Settings
+
+METHODS = ("ours", "random")
+METRICS = ("priors", "downstream")
+_LABELLED = 350  # positives, and as many negatives (paper, section 5.1)
+
+Report = Callable[[str, int, int, dict[str, float]], None]
+
+
+def evaluate(
+    runs: Sequence[Path],
+    prepared: Callable[[Path | None], Path],
+    data: Path | None,
+    metrics: Sequence[str],
+    methods: Sequence[str],
+    trials: int,
+    seed: int,
+    out: Path | None,
+    report: Report,
+) -> tuple[dict[str, Any], str]:
+    """Evaluate finished runs on test shapes and unseen categories; returns the JSON and a Markdown table.
+
+    prepared: the converted folder of a --data; data: overrides what a run was trained on. Writes evaluation.json and
+    evaluation.md into `out`, or into each run's folder. Raises UserError for what cannot be evaluated.
+    """
+    for given, known, flag in ((metrics, METRICS, "--metrics"), (methods, METHODS, "--methods")):
+        for name in given:
+            if name not in known:
+                raise UserError(f"{flag} {name}: not one of {', '.join(known)}")
+    if trials < 1:
+        raise UserError(f"--trials {trials}: must be at least 1")
+    begun = time.monotonic()
+    evaluated = []
+    for folder in runs:
+        result = _evaluate_run(Path(folder), prepared, data, metrics, methods, trials, seed, report)
+        evaluated.append(result)
+        if out is None:
+            _write(Path(folder), {"runs": [result]})
+    everything = {"runs": evaluated, "seconds": round(time.monotonic() - begun, 1)}
+    if out is not None:
+        out.mkdir(parents=True, exist_ok=True)
+        _write(out, everything)
+    return everything, _tables(evaluated)
+
+
+def _evaluate_run(folder, prepared, data, metrics, methods, trials, seed, report) -> dict[str, Any]:
+    config = read_config(folder)
+    task = TASKS[config["task"]]
+    priors = Priors.load(folder / "priors")
+    settings = from_json(Settings, config["settings"], f"{folder}/config.json: settings")
+    converted = Data(prepared(data or (config["data"] and Path(config["data"]))))
+    key = jax.random.key(seed)
+    rows, scores = [], []
+    for number, split in enumerate(SPLITS[1:]):
+        try:
+            env = converted.env(split, task, config["impl"], settings.env, settings.physics)
+        except DataError as e:
+            report(f"{split} left out: {e}", 1, 1, {})
+            continue
+        kd, kp = jax.random.split(jax.random.fold_in(key, number))
+        if "downstream" in metrics:
+            rows += evaluate_split(split, env, priors, methods, trials, settings.evaluation.proposals, kd, report)
+        if "priors" in metrics:
+            scores.append({"split": split, **_priors_split(folder, env, priors, settings, kp, split, report)})
+    if not rows and not scores:
+        raise UserError(f"{converted.folder}: has no test object for task {task.name}; see splits.json")
+    return {"run": str(folder), "task": task.name, "seed": seed, "downstream": rows, "priors": scores}
+
+
+def evaluate_split(
+    split: str,
+    env: Env,
+    priors: Priors,
+    methods: Sequence[str],
+    trials: int,
+    proposals: int,
+    key: jax.Array,
+    report: Report,
+) -> list[dict[str, Any]]:
+    """One row per method: the same views and tasks for all. Consumes the key."""
+    rows = []
+    for name in methods:
+        if name == "ours":
+            clouds = clouds_of(env.views, priors.config.networks.pointnet)
+            trial = ProposalTrials(env, clouds, priors.networks, proposals)
+
+            def method(start: Start, key: jax.Array, trial: ProposalTrials = trial) -> EnvState:
+                return trial.best(priors.params, start, key)[0]
+        else:
+            method = random_method(env)
+        label = f"evaluate {name} on {split}"
+        result = downstream(env, method, trials, key, lambda done, label=label: report(label, done, trials, {}))
+        report(label, trials, trials, {"success": result["success"]})
+        rows.append({"split": split, "method": name, **result})
+    return rows
+
+
+def _priors_split(
+    folder: Path, env: Env, priors: Priors, settings: Settings, key: jax.Array, split: str, report: Report
+) -> dict[str, float]:
+    explorer = Explorer(env, settings.explore)
+    path = folder / "policy.msgpack"
+    try:
+        policy = serialization.from_bytes(explorer.init(key).td3.policy, path.read_bytes())
+    except (OSError, ValueError, KeyError, TypeError) as e:
+        raise UserError(
+            f"{path}: cannot be read ({str(e).splitlines()[0]}); finish the run, or leave out --metrics priors"
+        ) from e
+    kl, km = jax.random.split(key)
+    report(f"label trajectories on {split}", 0, 1, {})
+    positive, negative = labelled(explorer, policy, _LABELLED, kl)
+    if len(positive.view) == 0:
+        return {"positives": 0}
+    clouds = clouds_of(env.views, priors.config.networks.pointnet)
+    result = priors_metrics(
+        priors.networks, priors.params, clouds, positive, negative, km, proposals=settings.evaluation.proposals
+    )
+    report(f"label trajectories on {split}", 1, 1, {})
+    return result
+
+
+def markdown(rows: Sequence[dict[str, Any]]) -> str:
+    """The table of downstream success, one line per task, method and split."""
+    lines = [
+        "| task | method | split | success | 95% interval | any waypoint | start in collision | trials |",
+        "|---|---|---|---|---|---|---|---|",
+    ]
+    for row in rows:
+        low, high = row["ci95"]
+        lines.append(
+            f"| {row['task']} | {row['method']} | {row['split']} | {row['success']:.1%} | {low:.1%} to {high:.1%} "
+            f"| {row['success_any_waypoint']:.1%} | {row['in_collision']:.1%} | {row['trials']} |"
+        )
+    return "\n".join(lines)
+
+
+def _tables(runs: Sequence[dict[str, Any]]) -> str:
+    rows = [{"task": run["task"], **row} for run in runs for row in run["downstream"]]
+    parts = [markdown(rows)] if rows else []
+    scores = [(run["task"], row) for run in runs for row in run["priors"] if row["positives"]]
+    if scores:
+        names = ("accuracy", "precision", "recall", "f_score", "coverage")
+        lines = [f"| task | split | {' | '.join(names)} |", "|---" * (2 + len(names)) + "|"]
+        lines += [f"| {t} | {row['split']} | " + " | ".join(f"{row[n]:.1%}" for n in names) + " |" for t, row in scores]
+        parts.append("\n".join(lines))
+    return "\n\n".join(parts)
+
+
+def _write(folder: Path, everything: dict[str, Any]) -> None:
+    write_json(folder / "evaluation.json", everything)
+    write_text(folder / "evaluation.md", _tables(everything["runs"]) + "\n")

@@ -1,0 +1,210 @@
+"""The perception networks: encoders of view, contact, task and trajectory, and the three heads (paper, 4.2 and B).
+
+Layer sizes are the paper's. It leaves the activations open, and the released code leaves out most of them (its
+decoder is affine in z); here every hidden layer of a head or of the trajectory encoder is followed by a leaky ReLU,
+and the paper's single fully connected layers (contact, task) are linear.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from functools import partial
+from typing import NamedTuple
+
+import flax.linen as nn
+import jax
+import jax.numpy as jnp
+
+from vatmart_jax.geometry import TRAJECTORY, WAYPOINTS, matrix_from_rot6d, rot6d_from_matrix
+from vatmart_jax.perception.pointnet2 import Grouping, PointNet2, PointNetConfig
+
+Params = dict  # of the networks' names to their Flax parameters
+
+# What enters a network is brought to the order of 1: residual moves are 0.05 to 0.3 unit lengths, Euler residuals
+# 0.1 to 0.5 rad, tasks 0.1 to 1.2 (rad or unit lengths), contacts already -1 to 1. The decoder's output is scaled back.
+TASK_SCALE = 3.0
+MOVE_SCALE = 5.0
+TURN_SCALE = 2.0
+SCALE = (1.0,) * 6 + ((MOVE_SCALE,) * 3 + (TURN_SCALE,) * 3) * WAYPOINTS  # of the 30 numbers of a trajectory
+
+
+@dataclass(frozen=True)
+class NetworksConfig:
+    """Sizes of the networks; the defaults are the paper's."""
+
+    pointnet: PointNetConfig = field(default_factory=PointNetConfig)
+    separate: bool = False
+    """One point cloud encoder for each head, as in the released code, instead of one for all three."""
+    contact_dim: int = 32
+    """Width of the contact point's feature."""
+    task_dim: int = 32
+    """Width of the task's feature."""
+    trajectory: tuple[int, ...] = (128, 128, 128)
+    """Widths of the trajectory encoder."""
+    latent_dim: int = 128
+    """Dimensions of the cVAE's Gaussian."""
+    posterior: tuple[int, ...] = (128, 128)
+    """Hidden widths of the cVAE's encoder."""
+    decoder: tuple[int, ...] = (512, 256)
+    """Hidden widths of the cVAE's decoder."""
+    scorer: tuple[int, ...] = (128,)
+    """Hidden widths of the trajectory scoring head."""
+    actionability: tuple[int, ...] = (128, 128, 128, 128)
+    """Hidden widths of the actionability head."""
+
+
+class Features(NamedTuple):
+    """What each head reads of a view at Q query points; the same array where the heads share an encoder."""
+
+    scorer: jax.Array  # [Q, feature_dim]
+    proposal: jax.Array  # [Q, feature_dim]
+    actionability: jax.Array  # [Q, feature_dim]
+
+
+@dataclass(frozen=True)
+class Networks:
+    """The networks as functions of their parameters.
+
+    Heads broadcast: features [..., F], contact [..., 3], task [...], trajectory [..., 30] and z [..., latent] may
+    have any leading dimensions that broadcast against each other. What is shared is computed once: P proposals at Q
+    points take features [Q, 1, F] and z [P, latent].
+    """
+
+    config: NetworksConfig = field(default_factory=NetworksConfig)
+
+    @partial(jax.jit, static_argnums=0)
+    def init(self, key: jax.Array) -> Params:
+        """Consumes the key. Returns a plain dict with one entry per network."""
+        pointnet = self.config.pointnet
+        n = pointnet.levels[0].centroids
+        sizes = [n, *(level.centroids for level in pointnet.levels)]
+        index = lambda *shape: jnp.zeros(shape, jnp.int16)  # noqa: E731
+        grouping = Grouping(
+            jnp.zeros((1, 3)),
+            tuple(index(m) for m in sizes[1:]),
+            tuple(index(m, level.neighbours) for m, level in zip(sizes[1:], pointnet.levels, strict=True)),
+            tuple(index(t, 3) for t in (1, *sizes[1:-1])),
+            tuple(jnp.zeros((t, 3), jnp.float16) for t in (1, *sizes[1:-1])),
+        )
+        f, contact, task = jnp.zeros(pointnet.feature_dim), jnp.zeros(3), jnp.zeros(())
+        trajectory, z = jnp.zeros(TRAJECTORY), jnp.zeros(self.config.latent_dim)
+        keys = iter(jax.random.split(key, 7))
+        params = {
+            name: PointNet2(pointnet).init(next(keys), jnp.zeros((n, 3)), grouping)["params"]
+            for name in self.encoders("scorer", "proposal", "actionability")
+        }
+        params["scorer"] = self._scorer.init(next(keys), f, contact, task, trajectory)["params"]
+        params["posterior"] = self._posterior.init(next(keys), f, contact, task, trajectory)["params"]
+        params["decoder"] = self._decoder.init(next(keys), f, contact, task, z)["params"]
+        params["actionability"] = self._actionability.init(next(keys), f, contact, task)["params"]
+        return params
+
+    def encoders(self, *heads: str) -> tuple[str, ...]:
+        """Names in the parameters of the point cloud encoders that these heads read."""
+        return tuple(f"{head}_encoder" for head in heads) if self.config.separate else ("encoder",)
+
+    def features(
+        self, params: Params, points: jax.Array, grouping: Grouping, which: jax.Array | None = None
+    ) -> Features:
+        """Encodes one view: points [N, 3], which [Q] int into the grouping's queries (None for all).
+
+        vmap it over views. What no head reads afterwards is not computed under jit.
+        """
+        encode = lambda name: PointNet2(self.config.pointnet).apply({"params": params[name]}, points, grouping, which)  # noqa: E731
+        found = [encode(name) for name in self.encoders(*Features._fields)]
+        return Features(*(found if self.config.separate else found * 3))  # pyright: ignore[reportArgumentType]
+
+    def score(
+        self, params: Params, f: Features, contact: jax.Array, task: jax.Array, trajectory: jax.Array
+    ) -> jax.Array:
+        """Logit [...] that the trajectory does the task; trajectories as `geometry.pack_trajectory` makes them."""
+        return self._scorer.apply({"params": params["scorer"]}, f.scorer, contact, task, trajectory)[..., 0]  # pyright: ignore
+
+    def posterior(
+        self, params: Params, f: Features, contact: jax.Array, task: jax.Array, trajectory: jax.Array
+    ) -> tuple[jax.Array, jax.Array]:
+        """Mean and log variance [..., latent] of the cVAE's encoder."""
+        out = self._posterior.apply({"params": params["posterior"]}, f.proposal, contact, task, trajectory)
+        return tuple(jnp.split(out, 2, -1))  # pyright: ignore
+
+    def decode(self, params: Params, f: Features, contact: jax.Array, task: jax.Array, z: jax.Array) -> jax.Array:
+        """The decoder's raw output [..., 30]: as `propose`, the first six numbers not orthonormal."""
+        out = self._decoder.apply({"params": params["decoder"]}, f.proposal, contact, task, z)
+        return out / jnp.array(SCALE)  # pyright: ignore[reportOperatorIssue]
+
+    def propose(self, params: Params, f: Features, contact: jax.Array, task: jax.Array, z: jax.Array) -> jax.Array:
+        """Trajectories [..., 30] for z [..., latent] drawn from a standard normal distribution."""
+        raw = self.decode(params, f, contact, task, z)
+        return jnp.concatenate([rot6d_from_matrix(matrix_from_rot6d(raw[..., :6])), raw[..., 6:]], -1)
+
+    def actionability(self, params: Params, f: Features, contact: jax.Array, task: jax.Array) -> jax.Array:
+        """Logit [...] of the actionability score."""
+        head = self._actionability
+        return head.apply({"params": params["actionability"]}, f.actionability, contact, task)[..., 0]  # pyright: ignore
+
+    @property
+    def _scorer(self) -> TrajectoryHead:
+        return TrajectoryHead(self.config, (*self.config.scorer, 1))
+
+    @property
+    def _posterior(self) -> TrajectoryHead:
+        return TrajectoryHead(self.config, (*self.config.posterior, 2 * self.config.latent_dim))
+
+    @property
+    def _decoder(self) -> Head:
+        return Head(self.config, (*self.config.decoder, TRAJECTORY))
+
+    @property
+    def _actionability(self) -> Head:
+        return Head(self.config, (*self.config.actionability, 1))
+
+
+class Head(nn.Module):
+    """Dense layers on the view's feature, the encoded contact and task, and further inputs, if any."""
+
+    config: NetworksConfig
+    widths: tuple[int, ...]
+
+    @nn.compact
+    def __call__(self, f: jax.Array, contact: jax.Array, task: jax.Array, *more: jax.Array) -> jax.Array:
+        contact = nn.Dense(self.config.contact_dim, name="contact")(contact)
+        task = nn.Dense(self.config.task_dim, name="task")(TASK_SCALE * task[..., None])
+        x = DenseOfParts(self.widths[0])(f, contact, task, *more)
+        for width in self.widths[1:]:
+            x = nn.Dense(width)(nn.leaky_relu(x))
+        return x
+
+
+class TrajectoryHead(nn.Module):
+    """A Head that also reads an encoded trajectory."""
+
+    config: NetworksConfig
+    widths: tuple[int, ...]
+
+    @nn.compact
+    def __call__(self, f: jax.Array, contact: jax.Array, task: jax.Array, trajectory: jax.Array) -> jax.Array:
+        x = trajectory * jnp.array(SCALE)
+        for width in self.config.trajectory[:-1]:
+            x = nn.leaky_relu(nn.Dense(width)(x))
+        x = nn.Dense(self.config.trajectory[-1])(x)
+        return Head(self.config, self.widths)(f, contact, task, x)
+
+
+class DenseOfParts(nn.Module):
+    """A dense layer on the concatenation of parts [..., d_i], whose leading dimensions may differ and broadcast.
+
+    The sum of one product per part, so that a part that many rows share is multiplied once.
+    """
+
+    width: int
+
+    @nn.compact
+    def __call__(self, *parts: jax.Array) -> jax.Array:
+        sizes = [part.shape[-1] for part in parts]
+        kernel = self.param("kernel", nn.initializers.lecun_normal(), (sum(sizes), self.width))
+        total = self.param("bias", nn.initializers.zeros, (self.width,))
+        start = 0
+        for part, size in zip(parts, sizes, strict=True):
+            total = total + part @ kernel[start : start + size]
+            start += size
+        return total
