@@ -1,16 +1,15 @@
 """Triangle soups of one rigid group -> few convex hulls that a gripper meets where it sees the surface.
 
-Hull first: most semantic leaves of PartNet are boards, whose hull is already right. Concave leaves fall into
-connected components, then are cut along their own large planes (the soup itself is cut: no manifold is needed), and
-what planes do not cut well goes to CoACD. Hulls are then merged while that fills no free space, and on to the
-budget. Two distances decide everything: *phantom* (hull surface in free space, its distance from the visual surface)
-and *gap* (visual surface outside all hulls).
+Hull first: most semantic leaves of PartNet are boards, whose hull is already right. A concave leaf falls into
+connected components, and those into flat patches that grow together again while their common hull stays out of free
+space (bottom up, so no manifold is needed; CoACD wants one, and takes ten times as long for more pieces). Hulls of all
+leaves are then merged in the same way, and on to the budget. Two distances decide everything: *phantom* (hull surface
+in free space, its distance from the visual surface) and *gap* (visual surface outside all hulls).
 """
 
 from __future__ import annotations
 
 import heapq
-import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -24,13 +23,15 @@ from scipy.spatial import ConvexHull, KDTree, QhullError
 
 from conversion.partnet import Hull, Visual, clean
 
+MAX_ROUNDING = 0.003  # hulls merge freely only where the vertex limit costs no more surface than this
+
 
 @dataclass(frozen=True)
 class DecomposeConfig:
     """All lengths in unit lengths of the object (its extents are 1 to 2)."""
 
-    decomposer: Literal["planes", "coacd"] = "planes"
-    """How concave leaves are cut: along their planes (CoACD where that fails), or always by CoACD."""
+    decomposer: Literal["hulls", "coacd"] = "hulls"
+    """How concave leaves are taken apart: hulls grown from their flat patches, or CoACD."""
     tolerance: float = 0.015
     """A leaf is one hull where that reaches no farther than this into free space."""
     handle_tolerance: float = 0.008
@@ -39,8 +40,6 @@ class DecomposeConfig:
     """Hulls merge freely where the result reaches no farther than this into free space (half of it for handles)."""
     max_vertices: int = 32
     """Vertices per hull."""
-    max_pieces: int = 32
-    """Pieces one concave component may be cut into."""
     thickness: float = 0.003
     """Flat leaves are padded to this thickness: MuJoCo refuses coplanar meshes."""
 
@@ -104,8 +103,11 @@ class Surface:
         occupied = np.zeros(self.shape, bool)
         occupied[tuple(self._cell(np.concatenate([dense, vertices])).T)] = True
         free, _ = ndimage.label(~ndimage.binary_dilation(occupied))  # type: ignore[misc]
-        outside = free == free[0, 0, 0]
-        self.depth = ndimage.distance_transform_edt(~outside).astype(np.float32) * self.voxel  # type: ignore[union-attr]
+        reached = free == free[0, 0, 0]
+        self.layer = np.full(self.shape, 4, np.uint8)  # voxels between a cell and the space outside, 4 = further in
+        for k in (3, 2, 1, 0):
+            grown = ndimage.binary_dilation(reached, iterations=k) if k else reached
+            self.layer[grown] = k
 
     def _sample(self, triangles: np.ndarray, n: int) -> tuple[np.ndarray, np.ndarray]:
         return sample(triangles, n, self.rng)
@@ -113,14 +115,14 @@ class Surface:
     def _cell(self, points: np.ndarray) -> np.ndarray:
         return np.clip(((points - self.low) / self.voxel).astype(int), 0, self.shape - 1)
 
-    def outside_depth(self, points: np.ndarray) -> np.ndarray:
-        """Distance [n] from points to the space that can be reached, 0 in it."""
-        return self.depth[tuple(self._cell(points).T)]
+    def layers(self, points: np.ndarray) -> np.ndarray:
+        """Voxels [n] between points and the space that can be reached: 0 in it, 4 where it is further."""
+        return self.layer[tuple(self._cell(points).T)]
 
     def hidden(self, visual: Visual) -> bool:
         """Nothing outside can touch this visual."""
         points, _ = self._sample(visual.vertices[visual.faces], 200)
-        return bool((self.outside_depth(np.concatenate([points, visual.vertices])) > 3 * self.voxel).all())
+        return bool((self.layers(np.concatenate([points, visual.vertices])) > 3).all())
 
     def distance(self, points: np.ndarray) -> np.ndarray:
         """Distance [n] to the surface; exact for the triangles of the four nearest samples."""
@@ -133,7 +135,7 @@ class Surface:
     def phantom(self, points: np.ndarray, refine_above: float = 0.003) -> np.ndarray:
         """Distance [n] of points in reachable space to the surface, 0 for points inside."""
         d = self.tree.query(points)[0]
-        d[(d > 1.8 * self.voxel) & (self.outside_depth(points) > 0)] = 0
+        d[(d > 1.8 * self.voxel) & (self.layers(points) > 0)] = 0
         far = d > refine_above
         if far.any():
             d[far] = self.distance(points[far])
@@ -148,6 +150,17 @@ class Surface:
             far = d > 0.003
             d[far] *= 1 + (self.handles.query(points[far], distance_upper_bound=0.05)[0] < 0.05)
         return float(d.max())
+
+    def harm(self, piece: _Piece, free: float) -> float:
+        """Hull area times how much farther than `free` it reaches into free space: what a forced merge costs."""
+        points, _ = self._sample(piece.triangles, 100)
+        excess = np.maximum(self.phantom(points) - free, 0)
+        # The longest way counts a little, so that of merges without harm the compact one comes first.
+        return float(excess.mean() * _areas(piece.triangles).sum() + 1e-6 * np.ptp(piece.points, axis=0).max())
+
+    def reachable(self, piece: _Piece) -> bool:
+        points, _ = self._sample(piece.triangles, 100)
+        return bool((self.layers(np.concatenate([points, piece.points])) <= 3).any())
 
 
 def sample(triangles: np.ndarray, n: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
@@ -220,6 +233,13 @@ class _Piece:
         """Signed distance [n] to the planes: above 0 outside (a lower bound there), below 0 inside."""
         return (points @ self.planes[:, :3].T + self.planes[:, 3]).max(axis=1)
 
+    def joined(self, other: _Piece, thickness: float) -> _Piece:
+        return _Piece.of(np.concatenate([self.points, other.points]), thickness, self.is_handle)
+
+    def rounding(self, config: DecomposeConfig) -> float:
+        """How far vertices stick out of the hull of as many as are allowed."""
+        return _few_vertices(self.points, config)[1] if len(self.points) > config.max_vertices else 0.0
+
     def holds(self, other: _Piece, slack: float = 0.001) -> bool:
         (low, high), (other_low, other_high) = self.bounds, other.bounds
         if (other_low < low - slack).any() or (other_high > high + slack).any():
@@ -270,31 +290,39 @@ def _few_vertices(points: np.ndarray, config: DecomposeConfig) -> tuple[np.ndarr
 
 
 def _leaf(visual: Visual, surface: Surface, config: DecomposeConfig) -> list[_Piece]:
-    """One visual as hulls: its own, those of its components, or those of their cuts."""
+    """One visual as hulls: its own, those of its components, or those that its patches grow into."""
     tolerance = config.handle_tolerance if visual.is_handle else config.tolerance
     whole = _Piece.of(visual.vertices, config.thickness, visual.is_handle)
     if surface.worst(whole, 300) <= tolerance:
         return [whole]
     if config.decomposer == "coacd":
-        return _coacd(visual.vertices, visual.faces, visual.is_handle, config)
+        return _coacd(visual, config)
     out = []
     for vertices, faces in _components(visual.vertices, visual.faces):
         piece = _Piece.of(vertices, config.thickness, visual.is_handle)
         if surface.worst(piece, 300) <= tolerance:
             out.append(piece)
         else:
-            out += _cut(*_coarse(vertices, faces, tolerance), surface, visual.is_handle, config)
+            patches = _patches(*_coarse(vertices, faces, tolerance), surface, tolerance, visual.is_handle, config)
+            out += _grow(patches, surface, tolerance, config)
     return out
 
 
 def _components(vertices: np.ndarray, faces: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
-    n = len(vertices)
     edges = np.concatenate([faces[:, :2], faces[:, 1:]])
+    label = _connected(len(vertices), edges)[faces[:, 0]]
+    return [_used(vertices, faces[rows]) for rows in _rows_by(label)]
+
+
+def _connected(n: int, edges: np.ndarray) -> np.ndarray:
+    """Component [n] of each node. edges: [e, 2]."""
     graph = coo_matrix((np.ones(len(edges)), tuple(edges.T)), shape=(n, n))
-    count, label = connected_components(graph, directed=False)
-    order = np.argsort(label[faces[:, 0]], kind="stable")
-    bounds = np.searchsorted(label[faces[order, 0]], np.arange(count + 1))
-    return [_used(vertices, faces[order[a:b]]) for a, b in itertools.pairwise(bounds) if b > a]
+    return connected_components(graph, directed=False)[1]
+
+
+def _rows_by(label: np.ndarray) -> list[np.ndarray]:
+    order = np.argsort(label, kind="stable")
+    return np.split(order, np.flatnonzero(np.diff(label[order])) + 1)
 
 
 def _used(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -303,9 +331,9 @@ def _used(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarr
 
 
 def _coarse(vertices: np.ndarray, faces: np.ndarray, tolerance: float) -> tuple[np.ndarray, np.ndarray]:
-    """Dense curved meshes by vertex clustering: cuts cost time per face, and need no more detail than the tolerance."""
+    """Dense curved meshes by vertex clustering: growing costs time per face, and needs no more detail than this."""
     for cell in (tolerance / 4, tolerance / 2):
-        if len(faces) <= 1500:
+        if len(faces) <= 600:
             break
         v, f = clean(vertices, faces, cell)
         if len(f):
@@ -313,245 +341,125 @@ def _coarse(vertices: np.ndarray, faces: np.ndarray, tolerance: float) -> tuple[
     return vertices, faces
 
 
-def _coacd(vertices: np.ndarray, faces: np.ndarray, is_handle: bool, config: DecomposeConfig) -> list[_Piece]:
+def _patches(
+    vertices: np.ndarray,
+    faces: np.ndarray,
+    surface: Surface,
+    tolerance: float,
+    is_handle: bool,
+    config: DecomposeConfig,
+) -> list[_Piece]:
+    """Connected coplanar faces as flat pieces; a patch that spans free space (a frame) as its single triangles."""
+    a, b, c = vertices[faces].transpose(1, 0, 2)
+    normals = np.cross(b - a, c - a)
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    edges = np.sort(np.concatenate([faces[:, :2], faces[:, 1:], faces[:, ::2]]), axis=1)
+    owner = np.tile(np.arange(len(faces)), 3)
+    order = np.lexsort(edges.T)
+    edges, owner = edges[order], owner[order]
+    shared = (edges[1:] == edges[:-1]).all(axis=1)
+    pairs = np.stack([owner[:-1][shared], owner[1:][shared]], axis=1)
+    flat = np.abs((normals[pairs[:, 0]] * normals[pairs[:, 1]]).sum(axis=1)) > 0.9995
+    out = []
+    for rows in _rows_by(_connected(len(faces), pairs[flat])):
+        piece = _Piece.of(vertices[np.unique(faces[rows])], config.thickness, is_handle)
+        if len(rows) == 1 or surface.worst(piece, 60) <= tolerance:
+            out.append(piece)
+        else:
+            out += [_Piece.of(vertices[face], config.thickness, is_handle) for face in faces[rows]]
+    return out
+
+
+def _coacd(visual: Visual, config: DecomposeConfig) -> list[_Piece]:
     import coacd
 
     coacd.set_log_level("error")
     parts = coacd.run_coacd(
-        coacd.Mesh(vertices, faces),
-        threshold=0.03 if is_handle else 0.05,
-        max_convex_hull=config.max_pieces,
+        coacd.Mesh(visual.vertices, visual.faces),
+        threshold=0.03 if visual.is_handle else 0.05,
         mcts_iterations=60,
-        mcts_max_depth=3,
         mcts_nodes=10,
         resolution=1000,
         seed=0,
     )
-    return [_Piece.of(np.asarray(v, np.float64), config.thickness, is_handle) for v, _ in parts if len(v)]
+    return [_Piece.of(np.asarray(v, np.float64), config.thickness, visual.is_handle) for v, _ in parts if len(v)]
 
 
-def _cut(
-    vertices: np.ndarray, faces: np.ndarray, surface: Surface, is_handle: bool, config: DecomposeConfig
-) -> list[_Piece]:
-    """Cut a soup by planes until every piece's hull is within the tolerance, the worst piece first.
+def _grow(pieces: list[_Piece], surface: Surface, tolerance: float, config: DecomposeConfig) -> list[_Piece]:
+    """Merge neighbours while phantom stays below the tolerance, what makes the smallest piece first."""
+    active = dict(enumerate(pieces))
+    bounds = np.array([p.bounds for p in pieces])  # [n, 2, 3]
+    heap: list[tuple[float, int, int]] = []
 
-    A cut is judged by the triangle area of the sides that stay concave: judged by volume, peeling a wall off an open
-    box would never pay.
-    """
-    tolerance = config.handle_tolerance if is_handle else config.tolerance
-    queue: list[tuple[float, int, float, _Piece, np.ndarray, np.ndarray]] = []
-    done: list[_Piece] = []
-    count = 0
+    def meet(i: int, others: np.ndarray) -> None:
+        near = (bounds[others, 0] <= bounds[i, 1] + tolerance) & (bounds[others, 1] >= bounds[i, 0] - tolerance)
+        others = others[near.all(axis=1)]
+        low, high = np.minimum(bounds[others, 0], bounds[i, 0]), np.maximum(bounds[others, 1], bounds[i, 1])
+        for size, j in zip(np.linalg.norm(high - low, axis=1).tolist(), others.tolist(), strict=True):
+            heapq.heappush(heap, (size, i, j))
 
-    def add(v: np.ndarray, f: np.ndarray) -> None:
-        nonlocal count
-        piece = _Piece.of(v, config.thickness, is_handle)
-        worst = surface.worst(piece, 300)
-        if worst <= tolerance:
-            done.append(piece)
-        else:
-            heapq.heappush(queue, (-worst * max(piece.volume, 1e-9) ** (1 / 3), count, worst, piece, v, f))
-            count += 1
-
-    add(vertices, faces)
-    while queue and len(queue) + len(done) < config.max_pieces:
-        _, _, worst, piece, v, f = heapq.heappop(queue)
-        halves = None
-        if plane := _best_plane(v, f, worst, surface, tolerance, config):
-            halves = _halves(v, f, *plane)
-        if halves is None:
-            done.append(piece)
-        else:
-            for half in halves:
-                add(*half)
-    return done + [entry[3] for entry in queue]
-
-
-def _best_plane(
-    v: np.ndarray, f: np.ndarray, worst: float, surface: Surface, tolerance: float, config: DecomposeConfig
-) -> tuple[np.ndarray, float] | None:
-    frames = [np.eye(3)]
-    axes = _axes(v - v.mean(axis=0))
-    if np.abs(axes).max(axis=1).min() < 0.995:
-        frames.append(axes)
-    triangles = v[f]
-    centres, areas = triangles.mean(axis=1), _areas(triangles)
-    best, best_cost = None, np.inf
-    for normal, offset in _candidate_planes(v, triangles, frames):
-        s = v @ normal - offset
-        s[np.abs(s) < 1e-6] = 0
-        below, above = _side_points(v, f, s)
-        if not (len(below) and len(above)):
+    for i in range(1, len(pieces)):
+        meet(i, np.arange(i))
+    while heap:
+        _, i, j = heapq.heappop(heap)
+        if i not in active or j not in active:
             continue
-        side = centres @ normal - offset
-        low, high = areas[side < -1e-6].sum(), areas[side > 1e-6].sum()
-        flat = areas.sum() - low - high
-        low, high = (flat, high) if low < 1e-9 else (low, flat) if high < 1e-9 else (low + flat / 2, high + flat / 2)
-        cost = 0.02 * abs(low - high)
-        for points, area in ((below, low), (above, high)):
-            if cost >= best_cost:
-                break
-            concave = _quick_worst(points, surface, tolerance, config)
-            if concave > tolerance:
-                cost += area * (0.5 + 0.5 * min(1.0, concave / worst))
-        if cost < best_cost:
-            best, best_cost = (normal, offset), cost
-    return best
-
-
-def _candidate_planes(v: np.ndarray, triangles: np.ndarray, frames: list[np.ndarray]):
-    """Planes of large coplanar faces, the extreme ones too (walls without thickness are peeled), and even cuts."""
-    a, b, c = triangles.transpose(1, 0, 2)
-    normals = np.cross(b - a, c - a)
-    area = np.linalg.norm(normals, axis=1)
-    normals /= area[:, None] + 1e-30
-    for axis in np.concatenate(frames):
-        along = v @ axis
-        low, high = along.min(), along.max()
-        if high - low < 0.004:
+        merged = active[i].joined(active[j], config.thickness)
+        # Few samples first: most pairs fail by much.
+        if any(surface.worst(merged, n) > tolerance for n in (40, 160)):
             continue
-        facing = np.abs(normals @ axis) > 0.98
-        if facing.any():
-            position = triangles[facing].mean(axis=1) @ axis
-            _, group = np.unique(np.round(position / 0.002), return_inverse=True)
-            weight = np.bincount(group.ravel(), area[facing])
-            for k in np.argsort(-weight)[:8]:
-                yield axis, float(np.clip(np.median(position[group.ravel() == k]), low, high))
-        for share in (0.25, 0.5, 0.75):
-            yield axis, float(low + share * (high - low))
-
-
-def _side_points(v: np.ndarray, f: np.ndarray, s: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """What each side's hull is made of: its vertices and where edges cross the plane. s: [n] signed distance."""
-    edges = np.concatenate([f[:, :2], f[:, 1:], f[:, ::2]])
-    i, j = edges[s[edges[:, 0]] * s[edges[:, 1]] < 0].T
-    crossing = v[i] + (s[i] / (s[i] - s[j]))[:, None] * (v[j] - v[i])
-    low, high = np.unique(f[s[f].min(axis=1) < 0]), np.unique(f[s[f].max(axis=1) > 0])
-    low, high = low[s[low] <= 0], high[s[high] >= 0]
-    flat = v[np.unique(f[(s[f] == 0).all(axis=1)])]
-    below = np.concatenate([v[low], crossing]) if len(low) else flat
-    above = np.concatenate([v[high], crossing]) if len(high) else flat
-    return below, above
-
-
-_LATTICE = np.random.default_rng(1).random((64, 2))
-_LATTICE[_LATTICE.sum(axis=1) > 1] = 1 - _LATTICE[_LATTICE.sum(axis=1) > 1]
-
-
-def _quick_worst(points: np.ndarray, surface: Surface, tolerance: float, config: DecomposeConfig) -> float:
-    """`Surface.worst` with few, fixed samples, exact only near the tolerance: thousands of planes are tried."""
-    try:
-        hull = ConvexHull(points)
-        triangles = points[hull.simplices]
-        if hull.volume < 1e-9:
-            raise QhullError
-    except (QhullError, ValueError):
-        triangles = _Piece.of(points, config.thickness).triangles
-    area = _areas(triangles)
-    total = np.cumsum(area)
-    n = len(_LATTICE)
-    index = np.searchsorted(total, (np.arange(n) + 0.5) / n * total[-1]).clip(0, len(triangles) - 1)
-    a, b, c = triangles[index].transpose(1, 0, 2)
-    on = a + _LATTICE[:, :1] * (b - a) + _LATTICE[:, 1:] * (c - a)
-    on = np.concatenate([on, triangles[np.argsort(-area)[:80]].mean(axis=1)])
-    d = surface.tree.query(on)[0]
-    d[(d > 1.8 * surface.voxel) & (surface.outside_depth(on) > 0)] = 0
-    near = (d > tolerance / 2) & (d < tolerance + 0.03)
-    if near.any():
-        d[near] = surface.distance(on[near])
-    return float(d.max())
-
-
-def _halves(v: np.ndarray, f: np.ndarray, normal: np.ndarray, offset: float):
-    """The soup below and above a plane, or None where one side has no face. Faces in the plane stay with both."""
-    s = v @ normal - offset
-    s[np.abs(s) < 1e-6] = 0
-    flat = (s[f] == 0).all(axis=1)
-    below, above = (s[f].max(axis=1) <= 0) & ~flat, (s[f].min(axis=1) >= 0) & ~flat
-    new: list[np.ndarray] = []
-    sides: dict[int, list[list[int]]] = {-1: [], 1: []}
-    for face in f[~(below | above | flat)]:
-        corners: dict[int, list[int]] = {-1: [], 1: []}
-        for i, j in zip(face, np.roll(face, -1), strict=True):
-            for sign, polygon in corners.items():
-                if sign * s[i] >= 0:
-                    polygon.append(int(i))
-            if s[i] * s[j] < 0:
-                new.append(v[i] + s[i] / (s[i] - s[j]) * (v[j] - v[i]))
-                for polygon in corners.values():
-                    polygon.append(len(v) + len(new) - 1)
-        for sign, p in corners.items():
-            sides[sign].extend([p[0], p[k], p[k + 1]] for k in range(1, len(p) - 1))
-    low = np.concatenate([f[below], np.array(sides[-1], int).reshape(-1, 3)])
-    high = np.concatenate([f[above], np.array(sides[1], int).reshape(-1, 3)])
-    if flat.any():
-        if len(low) and len(high):
-            low, high = np.concatenate([low, f[flat]]), np.concatenate([high, f[flat]])
-        elif len(low):
-            high = f[flat]
-        else:
-            low = f[flat]
-    if not (len(low) and len(high)):
-        return None
-    vertices = np.concatenate([v, np.array(new).reshape(-1, 3)])
-    return _used(vertices, low), _used(vertices, high)
+        if merged.rounding(config) > MAX_ROUNDING:
+            continue
+        del active[i], active[j]
+        for k in [k for k, p in active.items() if merged.holds(p)]:
+            del active[k]
+        new = len(bounds)
+        bounds = np.concatenate([bounds, [merged.bounds]])
+        others = np.fromiter(active, int, len(active))
+        active[new] = merged
+        meet(new, others)
+    return list(active.values())
 
 
 def _merge(pieces: list[_Piece], surface: Surface, free: float, budget: int, config: DecomposeConfig) -> list[_Piece]:
-    """Drop hulls inside others, merge pairs while phantom stays below `free`, then the cheapest down to the budget."""
+    """Drop hulls that are inside others or out of reach, merge those that may, then the cheapest down to the budget."""
     kept: list[_Piece] = []
     for piece in sorted(pieces, key=lambda p: -p.volume):
         if not any(k.holds(piece) for k in kept):
             kept.append(piece)
-    kept = _absorb(kept, surface, free, 3 * budget, config)
+    if len(kept) > 1:
+        kept = [p for p in kept if surface.reachable(p)] or kept[:1]
+    kept = _absorb(_grow(kept, surface, free, config), surface, 3 * budget, config)
+    if len(kept) <= budget:
+        return kept
     active = dict(enumerate(kept))
-    heap: list[tuple[float, int, int, float, _Piece]] = []
+    heap: list[tuple[float, int, int, _Piece]] = []
 
-    def consider(i: int, j: int, reach: float) -> None:
-        a, b = active[i], active[j]
-        if np.maximum(a.bounds[0] - b.bounds[1], b.bounds[0] - a.bounds[1]).max() > reach:
-            return
-        merged = _Piece.of(np.concatenate([a.points, b.points]), config.thickness, a.is_handle)
-        phantom = surface.worst(merged, 60)
-        if phantom <= 1.5 * free:
-            phantom = max(phantom, surface.worst(merged, 240))
-        growth = max(0.0, merged.volume - a.volume - b.volume) ** (1 / 3)
-        heapq.heappush(heap, (phantom + 1e-3 * growth, j, i, phantom, merged))
+    def meet(i: int, j: int) -> None:
+        merged = active[i].joined(active[j], config.thickness)
+        heapq.heappush(heap, (surface.harm(merged, free), i, j, merged))
 
-    def consider_all(reach: float) -> None:
-        for i in list(active):
-            for j in (j for j in active if j < i):
-                consider(i, j, reach)
-
-    reach, number = 0.04, len(kept)
-    consider_all(reach)
-    while True:
-        if not heap:
-            if len(active) <= budget or reach > 1:
-                break
-            reach = 9.0
-            consider_all(reach)
-            continue
-        _, j, i, phantom, merged = heapq.heappop(heap)
+    for i in active:
+        for j in range(i):
+            meet(i, j)
+    number = len(kept)
+    while len(active) > budget:
+        _, i, j, merged = heapq.heappop(heap)
         if i not in active or j not in active:
             continue
-        if phantom > free and len(active) <= budget:
-            break
-        if len(active) <= budget and _few_vertices(merged.points, config)[1] > 0.003:
-            continue  # free merges must not cost more surface than the vertex limit can give back
         del active[i], active[j]
         for k in [k for k, p in active.items() if merged.holds(p)]:
             del active[k]
         active[number] = merged
-        for k in list(active):
+        for k in active:
             if k != number:
-                consider(number, k, reach)
+                meet(number, k)
         number += 1
     return list(active.values())
 
 
-def _absorb(pieces: list[_Piece], surface: Surface, free: float, target: int, config: DecomposeConfig) -> list[_Piece]:
-    """Where there are far too many pieces for pairs of all: the smallest joins the best of its six nearest."""
+def _absorb(pieces: list[_Piece], surface: Surface, target: int, config: DecomposeConfig) -> list[_Piece]:
+    """Where there are far too many pieces for all pairs: the smallest joins the best of its six nearest."""
     size = lambda p: float(np.linalg.norm(p.bounds[1] - p.bounds[0]))  # noqa: E731
     pieces = sorted(pieces, key=size)
     while len(pieces) > target:
@@ -559,18 +467,11 @@ def _absorb(pieces: list[_Piece], surface: Surface, free: float, target: int, co
         apart = [
             np.maximum(0, np.maximum(small.bounds[0] - p.bounds[1], p.bounds[0] - small.bounds[1])).max() for p in rest
         ]
-        best = None
-        for k in np.argsort(apart, kind="stable")[:6]:
-            merged = _Piece.of(np.concatenate([small.points, rest[k].points]), config.thickness, small.is_handle)
-            phantom = surface.worst(merged, 60)
-            if best is None or phantom < best[0]:
-                best = (phantom, k, merged)
-            if phantom <= free:
-                break
-        assert best is not None
-        _, k, merged = best
-        rest[k] = merged
-        pieces = sorted((p for p in rest if p is merged or not merged.holds(p)), key=size)
+        near = np.argsort(apart, kind="stable")[:6].tolist()
+        merged = {k: small.joined(rest[k], config.thickness) for k in near}
+        best = min(near, key=lambda k: surface.harm(merged[k], config.merge_tolerance))
+        rest[best] = merged[best]
+        pieces = sorted((p for p in rest if p is merged[best] or not merged[best].holds(p)), key=size)
     return pieces
 
 
@@ -579,7 +480,7 @@ def fidelity(visuals: Sequence[Visual], hulls: Sequence[Hull], seed: int = 0) ->
     surface = Surface(visuals, seed + 1)
     pieces = [_Piece.of(h.vertices, 1e-6) for h in hulls]
     points, _ = sample(surface.triangles, 20_000, surface.rng)
-    points = points[surface.outside_depth(points) <= 2.5 * surface.voxel]
+    points = points[surface.layers(points) <= 2]
     gap = np.full(len(points), np.inf)
     for piece in pieces:
         gap = np.minimum(gap, piece.outside(points))
@@ -593,7 +494,7 @@ def fidelity(visuals: Sequence[Visual], hulls: Sequence[Hull], seed: int = 0) ->
                 on = on[other.outside(on) > -1e-4]
         skin.append(on)
     on = np.concatenate(skin) if skin else np.zeros((0, 3))
-    on = on[surface.outside_depth(on) <= 2.5 * surface.voxel]
+    on = on[surface.layers(on) <= 2]
     phantom = surface.phantom(on, 0.0) if len(on) else np.zeros(1)
     return Fidelity(
         float(np.percentile(gap, 95)),
