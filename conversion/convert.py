@@ -14,7 +14,7 @@ import shutil
 import time
 import traceback
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, fields
 from importlib.metadata import version
 from multiprocessing.connection import Connection, wait
 from pathlib import Path
@@ -28,6 +28,8 @@ from conversion.decompose import DecomposeConfig, decompose, fidelity
 from conversion.mjcf import MjcfConfig, to_mjcf
 from conversion.partnet import ConvertedObject, ObjectError
 from conversion.report import picture, save_png
+from conversion.scenes import scene_bank
+from conversion.views import views
 
 FORMAT = 1  # of the per-object folder; raise it when a change of this package must reach folders that are up to date
 URDF_NAMES = ("mobility.urdf", "mobility_vhacd.urdf")
@@ -38,7 +40,21 @@ _SOURCE_SUFFIXES = (".urdf", ".json", ".txt", ".obj", ".stl", ".ply")
 
 
 @dataclass(frozen=True)
-class ConvertConfig(DecomposeConfig, MjcfConfig):
+class BankConfig:
+    """What the banks are made with; changing it leaves converted objects as they are."""
+
+    views: int = 6
+    """Views of every Scene for a push task, and as many for a pull task."""
+    points: int = 4096
+    """Points per view; the paper has 10,000."""
+    contacts: int = 128
+    """Further pixels of the moving part per view: where a trial may touch."""
+    variants: int = 2
+    """Scenes per door or drawer: all other parts closed, then with some of them open."""
+
+
+@dataclass(frozen=True)
+class ConvertConfig(DecomposeConfig, MjcfConfig, BankConfig):
     part_budget: int = 16
     """Hulls per moving link."""
     static_budget: int = 32
@@ -102,8 +118,9 @@ def convert(sources: Sequence[Path], out: Path, config: ConvertConfig, jobs: int
             out.rmdir()
         more = f" (and {len(failures) - 1} more objects refused)" if len(failures) > 1 else ""
         raise ObjectError(failures[0]["reason"] + more)
-    _write_json(out / "convert.json", {"config": asdict(config), "versions": _versions(), "failed": failures})
-    _banks(out, current, config, record)
+    of_banks = _banks(out, current, config, jobs or os.cpu_count() or 1, record.get("banks"))
+    settings = {"config": asdict(config), "versions": _versions(), "failed": failures, "banks": of_banks}
+    _write_json(out / "convert.json", settings)
     reasons = [{"id": f["id"], "reason": f["reason"]} for f in failures]
     return ConvertResult(len(current) + len(failed), len(current), reasons, time.monotonic() - start)
 
@@ -124,7 +141,9 @@ def _object_folders(sources: Sequence[Path], out: Path) -> list[Path]:
 
 def _key(folder: Path, config: ConvertConfig) -> str:
     """Hash of all that a conversion depends on."""
-    digest = hashlib.sha256(json.dumps([FORMAT, asdict(config), _versions()], sort_keys=True).encode())
+    of_banks = {f.name for f in fields(BankConfig)}
+    settings = {name: value for name, value in asdict(config).items() if name not in of_banks}
+    digest = hashlib.sha256(json.dumps([FORMAT, settings, _versions()], sort_keys=True).encode())
     for path in sorted(folder.rglob("*")):
         if path.suffix.lower() in _SOURCE_SUFFIXES and path.is_file():
             digest.update(str(path.relative_to(folder)).encode())
@@ -204,8 +223,17 @@ def _convert_one(folder: Path, out: Path, config: ConvertConfig, split: str | No
         shutil.rmtree(part, ignore_errors=True)
 
 
-def _banks(out: Path, current: dict[str, str], config: ConvertConfig, record: dict[str, Any]) -> None:
-    """scenes.npz, views.npz and splits.json of the current objects, unless they are up to date."""
+def _banks(out: Path, current: dict[str, str], config: ConvertConfig, jobs: int, made: str | None) -> str:
+    """scenes.npz and views.npz of the current objects, unless `made` (what an earlier call returned) is the same."""
+    wanted = hashlib.sha256(json.dumps([FORMAT, asdict(config), sorted(current.items())]).encode()).hexdigest()
+    if wanted == made and (out / "scenes.npz").is_file() and (out / "views.npz").is_file():
+        return wanted
+    objects = [ConvertedObject.load(out / name) for name in sorted(current)]
+    bank = scene_bank(objects, config.variants, "hull", config.seed)
+    found, _ = views(objects, bank, config.views, config.points, config.contacts, config.seed, jobs)
+    bank.save(out / "scenes.npz")
+    found.save(out / "views.npz")
+    return wanted
 
 
 def _pool(

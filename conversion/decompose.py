@@ -23,6 +23,7 @@ from scipy.spatial import ConvexHull, KDTree, QhullError
 
 from conversion.partnet import Hull, Visual, clean
 
+MAX_DISTANCE = 0.1  # farther from the surface, how far no longer matters, and searching gets slow
 MAX_ROUNDING = 0.003  # hulls merge freely only where the vertex limit costs no more surface than this
 
 
@@ -107,7 +108,7 @@ class Surface:
         self.layer = np.full(self.shape, 4, np.uint8)  # voxels between a cell and the space outside, 4 = further in
         for k in (3, 2, 1, 0):
             grown = ndimage.binary_dilation(reached, iterations=k) if k else reached
-            self.layer[grown] = k
+            self.layer[np.asarray(grown)] = k
 
     def _sample(self, triangles: np.ndarray, n: int) -> tuple[np.ndarray, np.ndarray]:
         return sample(triangles, n, self.rng)
@@ -125,16 +126,17 @@ class Surface:
         return bool((self.layers(np.concatenate([points, visual.vertices])) > 3).all())
 
     def distance(self, points: np.ndarray) -> np.ndarray:
-        """Distance [n] to the surface; exact for the triangles of the four nearest samples."""
-        best, index = map(np.asarray, self.tree.query(points, k=4))
-        best = best[:, 0]
-        for column in index.T:
-            best = np.minimum(best, _point_triangle(points, self.triangles[self.owner[column]]))
+        """Distance [n] to the surface, at most MAX_DISTANCE; exact for the triangles of the four nearest samples."""
+        near, index = map(np.asarray, self.tree.query(points, k=4, distance_upper_bound=MAX_DISTANCE))
+        best = np.minimum(near[:, 0], MAX_DISTANCE)
+        rows = np.flatnonzero(near[:, 0] < MAX_DISTANCE)
+        for column in np.minimum(index[rows], len(self.owner) - 1).T:
+            best[rows] = np.minimum(best[rows], _point_triangle(points[rows], self.triangles[self.owner[column]]))
         return best
 
     def phantom(self, points: np.ndarray, refine_above: float = 0.003) -> np.ndarray:
-        """Distance [n] of points in reachable space to the surface, 0 for points inside."""
-        d = self.tree.query(points)[0]
+        """Distance [n] of points in reachable space to the surface, at most MAX_DISTANCE, 0 for points inside."""
+        d = np.minimum(self.tree.query(points, distance_upper_bound=MAX_DISTANCE)[0], MAX_DISTANCE)
         d[(d > 1.8 * self.voxel) & (self.layers(points) > 0)] = 0
         far = d > refine_above
         if far.any():

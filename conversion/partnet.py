@@ -22,6 +22,8 @@ import yourdfpy
 from scipy.spatial import ConvexHull, QhullError
 from scipy.spatial.transform import Rotation
 
+from vatmart_jax.errors import UserError
+
 MAX_COORDINATE = 1e3  # objects are normalised to about 2 unit lengths; anything near this is damage
 MAX_FILE_BYTES = 256 * 2**20
 MIN_SWING = np.deg2rad(10)  # a joint that travels less is no task
@@ -35,7 +37,7 @@ SMALL_WORDS = (
 OTHER_WORDS = ("shelf", "rack", "board", "key", "pedal", "leg", "seat", "fan", "blade", "screw", "slider", "screen")
 
 
-class ObjectError(ValueError):
+class ObjectError(UserError):
     """An object folder cannot be converted; one line that names the file, the thing and the remedy."""
 
 

@@ -32,6 +32,7 @@ from mjcf_assets.solids import (
     sweep,
     tub,
 )  # fmt: skip
+from vatmart_jax.errors import UserError
 
 # The order in which categories come: each of them early, and in proportions like those of the real set.
 CYCLE = (
@@ -42,7 +43,7 @@ CYCLE = (
 TRAINING = ("StorageFurniture", "Door", "Microwave", "Refrigerator")
 
 
-class GeneratorError(ValueError):
+class GeneratorError(UserError):
     """The arguments or the output folder cannot be used."""
 
 
@@ -590,14 +591,14 @@ def washing_machine(rng: np.random.Generator) -> list[Link]:
     strip = h * rng.uniform(0.12, 0.18)
     c = np.array([w / 2 + rng.uniform(-0.03, 0.03), rng.uniform(0.46, 0.54) * (h - strip) + 0.02, d])
     shell = Rect(0, 0, w, h - strip)
-    body.add("base_body", plate(shell, circle(c[:2], radius, 32), 2, d - t, d))
+    body.add("base_body", plate(shell, circle(c[:2], radius, 24), 2, d - t, d))
     body.add("base_body", board(Rect(0, h - strip, w, h), 0, d))
     for r in (Rect(0, 0, t, h - strip), Rect(w - t, 0, w, h - strip), Rect(t, 0, w - t, t)):
         body.add("base_body", board(r, 0, d - t))
     body.add("base_body", board(shell.shrink(t, 0), 0, t))
     inner = 0.97 * radius
     drum = [(inner + 0.01, -t), (inner + 0.01, t - d + 0.1), (0.02, t - d + 0.1), (0.02, t - d + 0.12)]
-    body.add("base_body", lathe([*drum, (inner, t - d + 0.12), (inner, -t)], c, 2, True, 32))
+    body.add("base_body", lathe([*drum, (inner, t - d + 0.12), (inner, -t)], c, 2, True, 24))
     # The door: a ring over the opening, a bowl of glass that reaches into it.
     outer, thick = min(radius * rng.uniform(1.1, 1.3), h - strip - c[1] - 0.01), rng.uniform(0.03, 0.06)
     side = str(rng.choice(["left", "right"]))
@@ -606,11 +607,11 @@ def washing_machine(rng: np.random.Generator) -> list[Link]:
     axis = c + np.array([sign * outer, 0, thick])
     link.joint = Joint(axis, np.array([0.0, sign, 0]), float(np.radians(rng.choice([90, 110, 130, 150]))))
     glass, rim = 0.85 * radius, thick * rng.uniform(0.4, 1)
-    link.add("door", lathe([(glass, 0.002), (outer, 0.002), (0.95 * outer, thick), (glass, rim)], c, 2, True, 32))
+    link.add("door", lathe([(glass, 0.002), (outer, 0.002), (0.95 * outer, thick), (glass, rim)], c, 2, True, 24))
     sag = rng.uniform(0.2, 0.5) * glass
     bowl = [(glass * np.cos(a), -sag * np.sin(a)) for a in np.linspace(0, 1.4, 6)]
     link.add("door", lathe([*((r - 0.008, z + 0.016) for r, z in bowl[::-1]), *((r, z + 0.004) for r, z in bowl)], c, 2,
-                           sides=32))  # fmt: skip
+                           sides=24))  # fmt: skip
     if rng.random() < 0.6:
         a = np.linspace(-0.35, 0.35, 7) + (np.pi if side == "right" else 0)
         mid = 0.5 * (glass + outer)
