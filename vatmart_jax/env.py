@@ -311,7 +311,8 @@ class Env:
         )
         obs, distance = self._observe(state)
         terms = reward_terms(task, before, moved, distance, success)
-        metrics = {name: jnp.where(active, value, 0.0) for name, value in terms.items()}
+        # Not 0.0: a weakly typed leaf that reset's state has not would compile every caller twice.
+        metrics = {name: jnp.where(active, value, jnp.zeros_like(task)) for name, value in terms.items()}
         return state.replace(
             obs=obs,
             reward=sum(metrics.values()),
