@@ -1,0 +1,156 @@
+"""Priors: what is saved is what is loaded; damaged folders and wrong input are refused in one line."""
+
+import json
+from pathlib import Path
+
+import jax
+import numpy as np
+import pytest
+from flax import serialization
+from jax import export as jax_export
+
+from vatmart_jax.export import ExportError, export
+from vatmart_jax.inference import Priors, PriorsConfig, PriorsError
+from vatmart_jax.perception.networks import Networks, NetworksConfig
+from vatmart_jax.perception.pointnet2 import Level, PointNetConfig
+
+TINY = PointNetConfig(n_points=64, levels=(Level(16, 0.3, 8, (16,)), Level(4, 0.8, 4, (16,))), propagation=((16,),) * 2)
+
+
+@pytest.fixture(scope="module")
+def priors() -> Priors:
+    config = PriorsConfig("push-drawer", 0.1, 0.7, NetworksConfig(pointnet=TINY))
+    return Priors(config, Networks(config.networks).init(jax.random.key(0)))
+
+
+@pytest.fixture(scope="module")
+def points() -> np.ndarray:
+    return np.random.default_rng(0).uniform(-0.5, 0.5, (100, 3)).astype(np.float32)
+
+
+def test_loaded_priors_predict_what_the_saved_ones_do(priors: Priors, points: np.ndarray, tmp_path: Path) -> None:
+    priors.save(tmp_path / "priors")
+    priors.save(tmp_path / "priors")
+    loaded = Priors.load(tmp_path / "priors")
+    assert [p.name for p in tmp_path.iterdir()] == ["priors"]
+    assert loaded.config == priors.config
+    key = jax.random.key(1)
+    for a, b in zip(priors.predict(points, 0.3, key=key), loaded.predict(points, 0.3, key=key), strict=True):
+        np.testing.assert_array_equal(a, b)
+
+
+def test_a_prediction_has_the_promised_shapes_and_order(priors: Priors, points: np.ndarray) -> None:
+    found = priors.predict(points, 0.3, n_proposals=20)
+    assert found.actionability.shape == (100,)
+    assert found.trajectories.shape == (20, 30)
+    assert found.contact_index == found.actionability.argmax()
+    np.testing.assert_array_equal(found.contact, points[found.contact_index])
+    assert (np.diff(found.scores) <= 0).all() and (found.scores >= 0).all() and (found.scores <= 1).all()
+    up, forward = found.trajectories[:, :3], found.trajectories[:, 3:6]
+    np.testing.assert_allclose(np.linalg.norm(up, axis=1), 1, atol=1e-5)
+    np.testing.assert_allclose((up * forward).sum(1), 0, atol=1e-5)
+
+
+def test_the_contact_lies_on_the_masked_part(priors: Priors, points: np.ndarray) -> None:
+    mask = points[:, 2] > 0.2
+    assert mask[priors.predict(points, 0.3, mask).contact_index]
+
+
+@pytest.mark.parametrize("n", [10, 64, 500])
+def test_clouds_of_any_size_are_taken(priors: Priors, n: int) -> None:
+    found = priors.predict(np.random.default_rng(n).normal(size=(n, 3)), 0.3, n_proposals=5)
+    assert np.isfinite(found.actionability).all() and found.actionability.shape == (n,)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"points": np.zeros((4, 2))}, r"points: expected finite \[N, 3\] coordinates, found shape \(4, 2\)"),
+        ({"points": np.full((4, 3), np.nan)}, "points: expected finite"),
+        ({"points": np.zeros((0, 3))}, "points: expected finite"),
+        ({"task": -0.1}, "task: expected an amount above 0, found -0.1"),
+        ({"task": float("nan")}, "task: expected an amount above 0"),
+        ({"part_mask": np.zeros(100, bool)}, "part_mask: expected 100 booleans, one of them true"),
+        ({"part_mask": np.ones(3, bool)}, "part_mask: expected 100 booleans"),
+    ],
+)
+def test_wrong_input_is_named(priors: Priors, points: np.ndarray, change: dict, message: str) -> None:
+    with pytest.raises(PriorsError, match=message):
+        priors.predict(**({"points": points, "task": 0.3} | change))
+
+
+def damage(folder: Path, how: str) -> None:
+    params, config = folder / "params.msgpack", folder / "config.json"
+    if how == "truncated":
+        params.write_bytes(params.read_bytes()[: params.stat().st_size // 2])
+    elif how == "empty":
+        params.write_bytes(b"")
+    elif how == "noise":
+        params.write_bytes(np.random.default_rng(0).bytes(1000))
+    elif how == "no params":
+        params.unlink()
+    elif how == "no config":
+        config.unlink()
+    elif how == "config not JSON":
+        config.write_text("{")
+    elif how == "config of something else":
+        config.write_text("[1, 2]")
+    elif how == "unknown field":
+        config.write_text(json.dumps(json.loads(config.read_text()) | {"colour": 1}))
+    elif how == "other sizes":
+        text = json.loads(config.read_text())
+        text["networks"]["latent_dim"] = 7
+        config.write_text(json.dumps(text))
+    else:
+        tree = serialization.msgpack_restore(params.read_bytes())
+        if how == "missing network":
+            del tree["decoder"]
+        elif how == "not finite":
+            tree["scorer"]["Dense_0"]["bias"] = np.full_like(tree["scorer"]["Dense_0"]["bias"], np.nan)
+        params.write_bytes(serialization.msgpack_serialize(tree))
+
+
+@pytest.mark.parametrize(
+    ("how", "message"),
+    [
+        ("truncated", r"params.msgpack: cannot be read \(.*\); train or export the priors again"),
+        ("empty", "params.msgpack: cannot be read"),
+        ("noise", "params.msgpack: "),
+        ("no params", "params.msgpack: cannot be read"),
+        ("no config", "config.json: no such file; expected a folder of priors"),
+        ("config not JSON", "config.json: not a config of priors"),
+        ("config of something else", "config.json: not a config of priors"),
+        ("unknown field", "colour"),
+        ("other sizes", r"params.msgpack: parameter \['decoder'\].*expected float32"),
+        ("missing network", "parameter .*decoder.* is missing"),
+        ("not finite", "parameter .*scorer.* is not finite"),
+    ],
+)
+def test_damaged_priors_are_refused_in_one_line(priors: Priors, tmp_path: Path, how: str, message: str) -> None:
+    priors.save(tmp_path / "priors")
+    damage(tmp_path / "priors", how)
+    with pytest.raises(PriorsError, match=message) as caught:
+        Priors.load(tmp_path / "priors")
+    assert "\n" not in str(caught.value)
+
+
+def test_exported_stablehlo_computes_what_the_priors_do(priors: Priors, points: np.ndarray, tmp_path: Path) -> None:
+    files = export(priors, tmp_path / "out", n_proposals=10)
+    assert {str(f.relative_to(tmp_path / "out")) for f in files} == {
+        "flax/config.json", "flax/params.msgpack", "stablehlo/priors.bin", "stablehlo/signature.json",
+    }  # fmt: skip
+    assert Priors.load(tmp_path / "out" / "flax").config == priors.config
+    signature = json.loads((tmp_path / "out/stablehlo/signature.json").read_text())
+    assert signature["inputs"]["points"] == {"shape": [64, 3], "dtype": "float32"}
+    call = jax_export.deserialize(bytearray((tmp_path / "out/stablehlo/priors.bin").read_bytes())).call
+    found = call(points[:64], np.ones(64, bool), np.float32(0.3), np.uint32(5))
+    expected = priors.predict(points[:64], 0.3, key=jax.random.key(5), n_proposals=10)
+    assert int(found[0]) == expected.contact_index
+    for a, b in zip(found[1:], expected[2:], strict=True):
+        np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-5)
+
+
+def test_an_unknown_export_format_writes_nothing(priors: Priors, tmp_path: Path) -> None:
+    with pytest.raises(ExportError, match="--format onnx: not one of flax, stablehlo"):
+        export(priors, tmp_path / "out", ("flax", "onnx"))
+    assert not (tmp_path / "out").exists()

@@ -1,0 +1,228 @@
+"""The perception networks and their training, on a toy world whose answers are known (tests/synthetic.py)."""
+
+from dataclasses import replace
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from sklearn.metrics import roc_auc_score
+from synthetic import boxes, outcome, samples
+
+from vatmart_jax import geometry as g
+from vatmart_jax.perception import losses
+from vatmart_jax.perception import train as t
+from vatmart_jax.perception.networks import DenseOfParts, Features, Networks, NetworksConfig
+from vatmart_jax.perception.pointnet2 import Level, PointNetConfig
+
+TINY = PointNetConfig(
+    n_points=256, levels=(Level(64, 0.3, 12, (32, 32)), Level(16, 0.8, 12, (32, 64))), propagation=((64,), (64,))
+)
+CONFIG = t.PerceptionConfig(
+    networks=NetworksConfig(pointnet=TINY), high=0.5, views=4, queries=32, probes=8, proposals=16, steps_per_call=10
+)
+
+
+@pytest.fixture(scope="module")
+def world() -> tuple[t.Clouds, np.ndarray]:
+    return boxes(0, 60, TINY)
+
+
+@pytest.fixture(scope="module")
+def data(world) -> t.Samples:
+    return samples(1, *world, 2000)
+
+
+@pytest.fixture(scope="module")
+def fresh() -> t.PerceptionState:
+    return t.begin(jax.random.key(0), CONFIG)
+
+
+def trees_equal(a, b) -> bool:
+    return all(np.array_equal(x, y) for x, y in zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True))
+
+
+def test_layer_sizes_are_the_papers() -> None:
+    shapes = jax.eval_shape(Networks().init, jax.random.key(0))
+    sizes = lambda tree: [v.shape for k, v in jax.tree_util.tree_leaves_with_path(tree) if "kernel" in str(k[-1])]  # noqa: E731
+    traj = [(30, 128), (128, 128), (128, 128)]
+    common = [(3, 32), (1, 32)]
+    assert sorted(sizes(shapes["scorer"])) == sorted([*traj, *common, (320, 128), (128, 1)])
+    assert sorted(sizes(shapes["posterior"])) == sorted([*traj, *common, (320, 128), (128, 128), (128, 256)])
+    assert sorted(sizes(shapes["decoder"])) == sorted([*common, (320, 512), (512, 256), (256, 30)])
+    assert sorted(sizes(shapes["actionability"])) == sorted([*common, (192, 128), *[(128, 128)] * 3, (128, 1)])
+    assert sizes(shapes["encoder"])[:3] == [(6, 32), (32, 32), (32, 64)]
+
+
+def test_separate_encoders_do_not_share() -> None:
+    config = NetworksConfig(pointnet=TINY, separate=True)
+    params = jax.eval_shape(Networks(config).init, jax.random.key(0))
+    assert {"scorer_encoder", "proposal_encoder", "actionability_encoder"} < params.keys()
+    assert "encoder" not in params
+
+
+def test_a_dense_layer_of_parts_is_one_of_their_concatenation() -> None:
+    a, b = jax.random.normal(jax.random.key(0), (5, 1, 3)), jax.random.normal(jax.random.key(1), (7, 4))
+    layer = DenseOfParts(6)
+    params = layer.init(jax.random.key(2), a, b)
+    whole = jnp.concatenate([jnp.broadcast_to(a, (5, 7, 3)), jnp.broadcast_to(b, (5, 7, 4))], -1)
+    expected = whole @ params["params"]["kernel"] + params["params"]["bias"]
+    np.testing.assert_allclose(layer.apply(params, a, b), expected, rtol=1e-4, atol=1e-5)  # pyright: ignore
+
+
+def test_proposals_at_many_points_are_those_at_each(fresh) -> None:
+    networks = Networks(CONFIG.networks)
+    f, contact = jax.random.normal(jax.random.key(0), (5, 128)), jax.random.normal(jax.random.key(1), (5, 3))
+    task, z = jnp.linspace(0.1, 0.5, 5), jax.random.normal(jax.random.key(2), (7, 128))
+    at = lambda f: Features(f, f, f)  # noqa: E731
+    many = networks.propose(fresh.params, at(f[:, None]), contact[:, None], task[:, None], z)
+    one = networks.propose(fresh.params, at(f[3]), contact[3], task[3], z[2])
+    assert many.shape == (5, 7, 30)
+    np.testing.assert_allclose(many[3, 2], one, rtol=1e-4, atol=1e-4)
+    start, _ = g.unpack_trajectory(many)
+    np.testing.assert_allclose(
+        start @ jnp.swapaxes(start, -1, -2), jnp.broadcast_to(jnp.eye(3), (5, 7, 3, 3)), atol=1e-5
+    )
+    np.testing.assert_allclose(g.rot6d_from_matrix(start), many[..., :6], atol=1e-5)
+
+
+def test_score_loss_weighs_both_classes_alike() -> None:
+    logits = jnp.array([2.0, -1.0, -1.0, -1.0])
+    one = losses.score_loss(logits, jnp.array([1.0, 0, 0, 0]))
+    expected = 0.5 * np.log1p(np.exp(-2)) + 0.5 * np.log1p(np.exp(-1))
+    assert float(one) == pytest.approx(expected, rel=1e-5)
+
+
+def test_rows_without_weight_do_not_count_in_the_cvae() -> None:
+    predicted, truth = jnp.zeros((3, 30)), jnp.ones((3, 30)).at[0].set(100.0)
+    weights = jnp.array([0.0, 1.0, 1.0])
+    assert [float(x) for x in losses.reconstruction_losses(predicted, truth, weights)] == [1.0, 1.0, 6.0]
+    mean, log_variance = jnp.array([[9.0, 9], [1, 0], [0, 0]]), jnp.zeros((3, 2))
+    assert float(losses.kl_loss(mean, log_variance, weights)) == pytest.approx(0.25)
+
+
+def test_actionability_target_is_the_mean_of_the_best() -> None:
+    assert float(losses.actionability_target(jnp.array([0.1, 0.9, 0.5, 0.7]), 2)) == pytest.approx(0.8)
+
+
+def test_a_full_buffer_overwrites_its_oldest_rows(data) -> None:
+    buffer = t.Samples.empty(10)
+    new = jax.tree.map(lambda a: a[:8], data)
+    buffer = buffer.stored(new, 0).stored(new, 8)
+    np.testing.assert_array_equal(buffer.view[8:], new.view[:2])
+    np.testing.assert_array_equal(buffer.view[:6], new.view[2:])
+    np.testing.assert_array_equal(buffer.view[6:8], new.view[6:])
+
+
+def test_success_is_validity_and_tolerance() -> None:
+    made = t.Samples.empty(4)
+    made = replace(
+        made, task=jnp.full(4, 0.4), moved=jnp.array([0.45, 0.47, 0.35, 0.4]), valid=jnp.array([1, 1, 1, 0], bool)
+    )
+    assert made.success(0.15).tolist() == [True, False, True, False]
+
+
+def test_batches_hold_true_labels_and_only_filled_rows(world, data) -> None:
+    clouds, normals = world
+    buffer = t.Samples.empty(4096).stored(data, 3)
+    index = t._index(buffer, len(clouds))
+    draw = jax.jit(partial(t._draw, config=replace(CONFIG, mirror=False)))
+    for seed in range(3):
+        batch = draw(jax.random.key(seed), clouds, buffer, index)
+        view = [int(np.flatnonzero((np.asarray(clouds.contacts) == q).all((1, 2)))[0]) for q in batch.grouping.queries]
+        contact = batch.which[:, : CONFIG.queries]
+        moved, valid = outcome(clouds, normals, np.array(view)[:, None], np.asarray(contact), batch.trajectory)
+        achieved = valid & (moved >= CONFIG.low) & (moved <= CONFIG.high)
+        np.testing.assert_array_equal(batch.weight, achieved)
+        np.testing.assert_allclose(batch.achieved[achieved], moved[achieved], rtol=1e-3)
+        margin = np.abs(np.abs(moved - batch.task) / batch.task - CONFIG.tolerance) > 1e-3
+        truth = valid & (np.abs(moved - batch.task) <= CONFIG.tolerance * batch.task)
+        np.testing.assert_array_equal(np.asarray(batch.label)[margin], truth[margin])
+        assert 0.1 < float(batch.label.mean()) < 0.6
+        assert (batch.probe_task >= CONFIG.low).all() and (batch.which < clouds.contacts.shape[1]).all()
+
+
+def test_mirrored_and_turned_scenes_have_mirrored_and_turned_motions(world, data) -> None:
+    clouds, _ = world
+    index = t._index(data, len(clouds))
+    batch = t._draw(jax.random.key(0), clouds, data, index, replace(CONFIG, mirror=False))
+    one = jax.tree.map(lambda a: a[0], batch)
+    for mirrored in (False, True):
+        found = t.transformed(one, jnp.array(mirrored), jnp.float32(0.7))
+        turn = g.matrix_from_rotvec(jnp.array([0.0, 0.0, 0.7]))
+        whole = turn @ jnp.diag(jnp.array([1.0, -1.0 if mirrored else 1.0, 1.0]))
+        np.testing.assert_allclose(found.points, one.points @ whole.T, atol=1e-5)
+        np.testing.assert_allclose(found.grouping.queries, one.grouping.queries @ whole.T, atol=1e-5)
+        (start, steps), (start0, steps0) = g.unpack_trajectory(found.trajectory), g.unpack_trajectory(one.trajectory)
+        np.testing.assert_allclose(steps[..., :3], steps0[..., :3] @ whole.T, atol=1e-5)
+        hand = start[:, None] @ g.matrix_from_euler(steps[..., 3:])
+        hand0 = start0[:, None] @ g.matrix_from_euler(steps0[..., 3:])
+        # The hand is its own mirror image, left for right.
+        left = jnp.diag(jnp.array([1.0, -1.0 if mirrored else 1.0, 1.0]))
+        np.testing.assert_allclose(hand, whole @ hand0 @ left, atol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("stage", "resting"),
+    [("scorer", {"posterior", "decoder", "actionability"}), ("actionability", {"encoder", "scorer", "decoder"})],
+)
+def test_a_stage_changes_only_what_it_trains(world, data, fresh, stage: str, resting: set[str]) -> None:
+    after = t.train(fresh, world[0], data, CONFIG, stage, 3)
+    same = {name for name in fresh.params if trees_equal(fresh.params[name], after.params[name])}
+    assert resting <= same and same != set(fresh.params)
+
+
+def test_an_interrupted_stage_goes_on_bit_for_bit(world, data, fresh) -> None:
+    seen: list[t.PerceptionState] = []
+    whole = t.train(fresh, world[0], data, CONFIG, "joint", 25, lambda state, _: seen.append(state))
+    assert [int(s.step) for s in seen] == [10, 20, 25] and int(whole.step) == 0
+    resumed = t.train(seen[0], world[0], data, CONFIG, "joint", 25)
+    assert trees_equal(whole, resumed)
+
+
+def test_nothing_is_compiled_anew_when_samples_or_steps_change(world, data, fresh) -> None:
+    buffer = t.Samples.empty(4096)
+    before = t._steps._cache_size()
+    for at, steps in ((0, 2), (2000, 13), (4000, 7)):
+        buffer = buffer.stored(data, at)
+        fresh = t.train(fresh, world[0], buffer, replace(CONFIG, queries=24), "scorer", steps)
+    assert t._steps._cache_size() == before + 1
+
+
+def test_an_empty_buffer_is_refused(world, fresh) -> None:
+    with pytest.raises(ValueError, match="nothing to train the scorer stage on: the buffer has no samples"):
+        t.train(fresh, world[0], t.Samples.empty(8), CONFIG, "scorer", 1)
+
+
+@pytest.mark.slow
+def test_the_networks_learn_a_world_that_can_be_learned(world, fresh) -> None:
+    clouds, normals = boxes(0, 300, TINY)
+    data = samples(1, clouds, normals, 12_000)
+    config = replace(CONFIG, views=8, queries=48, steps_per_call=100)
+    state = t.train(fresh, clouds, data, config, "proposal", 700)
+    state = t.train(state, clouds, data, config, "actionability", 200)
+    networks, (clouds, normals) = Networks(config.networks), boxes(10, 64, TINY)
+    tests, rng = samples(11, clouds, normals, 1000), np.random.default_rng(12)
+    moved, valid = np.asarray(tests.moved), np.asarray(tests.valid)
+    task = np.clip(moved * np.exp(rng.choice([0.05, 0.6], 1000) * rng.uniform(-1, 1, 1000)), 0.1, 0.5)
+    label = valid & (np.abs(moved - task) <= 0.15 * task)
+    score = t.score_trajectories(
+        networks, state.params, clouds, tests.view, tests.contact, jnp.asarray(task, jnp.float32), tests.trajectory
+    )
+    auc = roc_auc_score(label, score)
+    view, task = jnp.arange(128) % 64, jnp.asarray(rng.uniform(0.15, 0.4, 128), jnp.float32)
+    chosen = t.select_actions(networks, state.params, clouds, view, task, jax.random.key(1))
+    moved, valid = outcome(clouds, normals, np.asarray(view), np.asarray(chosen.contact), chosen.trajectory)
+    success = (valid & (np.abs(moved - task) <= 0.15 * task)).mean()
+    point = np.asarray(clouds.contacts)
+    upper = point[..., 2] > point[..., 2].mean(1, keepdims=True)
+    proposed, _ = t.propose_trajectories(
+        networks, state.params, clouds, view, jnp.asarray(upper.argmax(1))[view], task, jax.random.key(2), 20
+    )
+    moved, valid = outcome(clouds, normals, np.asarray(view), upper.argmax(1)[np.asarray(view)], proposed)
+    conditional = (valid & (np.abs(moved - task[:, None]) <= 0.15 * task[:, None])).mean()
+    actionable = roc_auc_score(upper[np.asarray(view)].ravel(), np.asarray(chosen.actionability).ravel())
+    measured = {"auc": auc, "success": success, "proposals": conditional, "actionability": actionable}
+    print({name: round(float(value), 3) for name, value in measured.items()})
+    assert auc > 0.9 and success > 0.7 and conditional > 0.4 and actionable > 0.9, measured
