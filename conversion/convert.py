@@ -18,7 +18,7 @@ from dataclasses import asdict, dataclass, fields
 from importlib.metadata import version
 from multiprocessing.connection import Connection, wait
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
@@ -65,6 +65,8 @@ class ConvertConfig(DecomposeConfig, MjcfConfig, BankConfig):
     """Let joints without a limit turn or slide without end, instead of refusing the object."""
     time_limit: float = 120.0
     """Seconds per object; one that takes longer is refused."""
+    collision: Literal["hull", "box"] = "hull"
+    """Collision geometry: convex hulls, or oriented boxes, which MJX is fast with."""
     seed: int = 0
     """Of everything random in the conversion."""
 
@@ -84,10 +86,10 @@ def convert(sources: Sequence[Path], out: Path, config: ConvertConfig, jobs: int
     converted is listed in the result, and its folder of an earlier run removed. Raises ObjectError where nothing could
     be converted at all.
     """
-    start = time.monotonic()
+    start, jobs = time.monotonic(), jobs or os.cpu_count() or 1
     folders = _object_folders(sources, out)
-    keys = {f: _key(f, config) for f in folders}
     splits = _splits(sources)
+    keys = {f: _key(f, config, splits.get(f.resolve().name)) for f in folders}
     out.mkdir(parents=True, exist_ok=True)
     record = _read_json(out / "convert.json")
     refused = {r["id"]: r for r in record.get("failed", ()) if r.get("key") in keys.values()}
@@ -104,13 +106,14 @@ def convert(sources: Sequence[Path], out: Path, config: ConvertConfig, jobs: int
             current[name] = key
         else:
             work.append(folder)
-    tasks = [(f, out, config, splits.get(f.resolve().name), keys[f]) for f in work]
-    for (folder, *_), error in _pool(_convert_one, tasks, jobs or os.cpu_count() or 1, config.time_limit):
-        name = folder.resolve().name
+    # Resolved, so that a folder given as `.` has a name.
+    tasks = [(f.resolve(), out, config, splits.get(f.resolve().name), keys[f]) for f in work]
+    for (folder, *_, key), error in _pool(_convert_one, tasks, jobs, config.time_limit):
+        name = folder.name
         if error is None:
-            current[name] = keys[folder]
+            current[name] = key
         else:
-            failed[name] = {"id": name, "reason": error, "key": keys[folder]}
+            failed[name] = {"id": name, "reason": error, "key": key}
             shutil.rmtree(out / name, ignore_errors=True)
     failures = [failed[k] for k in sorted(failed)]
     if not current:
@@ -118,8 +121,8 @@ def convert(sources: Sequence[Path], out: Path, config: ConvertConfig, jobs: int
             out.rmdir()
         more = f" (and {len(failures) - 1} more objects refused)" if len(failures) > 1 else ""
         raise ObjectError(failures[0]["reason"] + more)
-    of_banks = _banks(out, current, config, jobs or os.cpu_count() or 1, record.get("banks"))
-    settings = {"config": asdict(config), "versions": _versions(), "failed": failures, "banks": of_banks}
+    banks = _banks(out, current, config, jobs, record.get("banks", {}))
+    settings = {"config": asdict(config), "versions": _versions(), "failed": failures, "banks": banks}
     _write_json(out / "convert.json", settings)
     reasons = [{"id": f["id"], "reason": f["reason"]} for f in failures]
     return ConvertResult(len(current) + len(failed), len(current), reasons, time.monotonic() - start)
@@ -139,11 +142,11 @@ def _object_folders(sources: Sequence[Path], out: Path) -> list[Path]:
     return folders
 
 
-def _key(folder: Path, config: ConvertConfig) -> str:
+def _key(folder: Path, config: ConvertConfig, split: str | None) -> str:
     """Hash of all that a conversion depends on."""
     of_banks = {f.name for f in fields(BankConfig)}
-    settings = {name: value for name, value in asdict(config).items() if name not in of_banks}
-    digest = hashlib.sha256(json.dumps([FORMAT, settings, _versions()], sort_keys=True).encode())
+    settings = {name: value for name, value in asdict(config).items() if name not in of_banks | {"time_limit"}}
+    digest = hashlib.sha256(json.dumps([FORMAT, settings, split, _versions()], sort_keys=True).encode())
     for path in sorted(folder.rglob("*")):
         if path.suffix.lower() in _SOURCE_SUFFIXES and path.is_file():
             digest.update(str(path.relative_to(folder)).encode())
@@ -180,7 +183,7 @@ def default_split(category: str, object_id: str) -> str:
 
 def _convert_one(folder: Path, out: Path, config: ConvertConfig, split: str | None, key: str) -> None:
     """One object folder, complete or not at all."""
-    start = time.monotonic()
+    start = time.process_time()
     obj = partnet.read_object(folder, continuous_range=config.continuous_range, allow_missing=config.allow_missing)
     parts, left_out = partnet.parts(obj)
     hulls, groups = {}, {}
@@ -207,7 +210,7 @@ def _convert_one(folder: Path, out: Path, config: ConvertConfig, split: str | No
         "left_out": [{"joint": j, "reason": why} for j, why in left_out],
         "notes": obj.notes,
         "groups": groups,
-        "seconds": round(time.monotonic() - start, 3),
+        "seconds": round(time.process_time() - start, 3),  # of one core
     }
     part = out / f".{obj.id}.part"
     shutil.rmtree(part, ignore_errors=True)
@@ -223,17 +226,26 @@ def _convert_one(folder: Path, out: Path, config: ConvertConfig, split: str | No
         shutil.rmtree(part, ignore_errors=True)
 
 
-def _banks(out: Path, current: dict[str, str], config: ConvertConfig, jobs: int, made: str | None) -> str:
-    """scenes.npz and views.npz of the current objects, unless `made` (what an earlier call returned) is the same."""
-    wanted = hashlib.sha256(json.dumps([FORMAT, asdict(config), sorted(current.items())]).encode()).hexdigest()
-    if wanted == made and (out / "scenes.npz").is_file() and (out / "views.npz").is_file():
-        return wanted
+def _banks(
+    out: Path, current: dict[str, str], config: ConvertConfig, jobs: int, made: dict[str, Any]
+) -> dict[str, Any]:
+    """Write splits.json, scenes.npz and views.npz of the current objects, unless `made` (returned earlier) fits them.
+
+    Returns the key of what was made, and why Scenes have no views.
+    """
+    key = hashlib.sha256(json.dumps([FORMAT, asdict(config), sorted(current.items())]).encode()).hexdigest()
+    if key == made.get("key") and all((out / f).is_file() for f in ("splits.json", "scenes.npz", "views.npz")):
+        return made
     objects = [ConvertedObject.load(out / name) for name in sorted(current)]
-    bank = scene_bank(objects, config.variants, "hull", config.seed)
-    found, _ = views(objects, bank, config.views, config.points, config.contacts, config.seed, jobs)
+    table: dict[str, dict[str, list[str]]] = {split: {} for split in SPLITS}
+    for o in objects:
+        table[o.split].setdefault(o.obj.category, []).append(o.obj.id)
+    bank = scene_bank(objects, config.variants, config.collision, config.seed)
+    found, without = views(objects, bank, config.views, config.points, config.contacts, config.seed, jobs)
+    _write_json(out / "splits.json", table)
     bank.save(out / "scenes.npz")
     found.save(out / "views.npz")
-    return wanted
+    return {"key": key, "without_views": [why for _, why in without]}
 
 
 def _pool(

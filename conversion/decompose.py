@@ -103,7 +103,8 @@ class Surface:
         dense, _ = self._sample(self.triangles, int(np.clip(4 * area / self.voxel**2, 2000, 600_000)))
         occupied = np.zeros(self.shape, bool)
         occupied[tuple(self._cell(np.concatenate([dense, vertices])).T)] = True
-        free, _ = ndimage.label(~ndimage.binary_dilation(occupied))  # type: ignore[misc]
+        free = np.zeros(self.shape, np.int32)
+        ndimage.label(~ndimage.binary_dilation(occupied), output=free)
         reached = free == free[0, 0, 0]
         self.layer = np.full(self.shape, 4, np.uint8)  # voxels between a cell and the space outside, 4 = further in
         for k in (3, 2, 1, 0):
