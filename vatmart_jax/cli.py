@@ -1,7 +1,6 @@
 """The `vatmart` command. Progress and logs go to standard error; `--json` prints one object on standard output."""
 
-from __future__ import annotations
-
+# No postponed annotations here: tyro reads those of the commands' dataclasses, which only their functions see.
 import json
 import os
 import sys

@@ -12,9 +12,9 @@ from flax import serialization
 
 from vatmart_jax.config import from_json
 from vatmart_jax.data import SPLITS, Data, DataError
-from vatmart_jax.env import TASKS, Env, EnvState, Start
+from vatmart_jax.env import TASKS, Env
 from vatmart_jax.errors import UserError
-from vatmart_jax.evaluation.downstream import downstream, random_method
+from vatmart_jax.evaluation.downstream import Method, downstream, random_method
 from vatmart_jax.evaluation.priors import labelled, priors_metrics
 from vatmart_jax.inference import Priors
 from vatmart_jax.perception.train import clouds_of
@@ -106,9 +106,7 @@ def evaluate_split(
         if name == "ours":
             clouds = clouds_of(env.views, priors.config.networks.pointnet)
             trial = ProposalTrials(env, clouds, priors.networks, proposals)
-
-            def method(start: Start, key: jax.Array, trial: ProposalTrials = trial) -> EnvState:
-                return trial.best(priors.params, start, key)[0]
+            method = _ours(trial, priors)
         else:
             method = random_method(env)
         label = f"evaluate {name} on {split}"
@@ -116,6 +114,10 @@ def evaluate_split(
         report(label, trials, trials, {"success": result["success"]})
         rows.append({"split": split, "method": name, **result})
     return rows
+
+
+def _ours(trial: ProposalTrials, priors: Priors) -> Method:
+    return lambda start, key: trial.best(priors.params, start, key)[0]
 
 
 def _priors_split(
