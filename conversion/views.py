@@ -105,7 +105,7 @@ class SceneMesh:
             v = np.einsum("ij,ij->i", rays, s) / determinant
             distance = np.einsum("ij,ij->i", ac, s) / determinant
         # A ray along a triangle's edge or plane may be found by one precision only.
-        inside = (u > -1e-4) & (v > -1e-4) & (u + v < 1 + 1e-4) & (distance > 0)
+        inside = (u > -1e-5) & (v > -1e-5) & (u + v < 1 + 1e-5) & (distance > 0)
         hit, rays, distance = hit[inside], rays[inside], distance[inside]
         normals = np.cross(ab[inside], ac[inside])
         normals *= -np.sign(np.einsum("ij,ij->i", normals, rays))[:, None]
