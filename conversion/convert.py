@@ -7,10 +7,12 @@ views.npz; splits.json; convert.json with what was asked and what was refused.
 from __future__ import annotations
 
 import hashlib
+import inspect
 import json
 import multiprocessing
 import os
 import shutil
+import sys
 import time
 import traceback
 from collections.abc import Callable, Iterator, Sequence
@@ -24,14 +26,13 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
 from conversion import partnet
-from conversion.decompose import DecomposeConfig, decompose, fidelity
+from conversion.decompose import DecomposeConfig, Surface, decompose, fidelity
 from conversion.mjcf import MjcfConfig, to_mjcf
 from conversion.partnet import ConvertedObject, ObjectError
 from conversion.report import picture, save_png
 from conversion.scenes import scene_bank
 from conversion.views import views
 
-FORMAT = 1  # of the per-object folder; raise it when a change of this package must reach folders that are up to date
 URDF_NAMES = ("mobility.urdf", "mobility_vhacd.urdf")
 TRAIN_CATEGORIES = ("StorageFurniture", "Door", "Microwave", "Refrigerator")  # paper, section 4.1
 TEST_CATEGORIES = ("Safe", "Table", "WashingMachine")
@@ -146,7 +147,9 @@ def _key(folder: Path, config: ConvertConfig, split: str | None) -> str:
     """Hash of all that a conversion depends on."""
     of_banks = {f.name for f in fields(BankConfig)}
     settings = {name: value for name, value in asdict(config).items() if name not in of_banks | {"time_limit"}}
-    digest = hashlib.sha256(json.dumps([FORMAT, settings, split, _versions()], sort_keys=True).encode())
+    digest = hashlib.sha256(json.dumps([settings, split, _versions()], sort_keys=True).encode())
+    for function in (partnet.read_object, decompose, to_mjcf):
+        digest.update(inspect.getsource(sys.modules[function.__module__]).encode())
     for path in sorted(folder.rglob("*")):
         if path.suffix.lower() in _SOURCE_SUFFIXES and path.is_file():
             digest.update(str(path.relative_to(folder)).encode())
@@ -189,11 +192,13 @@ def _convert_one(folder: Path, out: Path, config: ConvertConfig, split: str | No
     hulls, groups = {}, {}
     for root in obj.groups:
         budget = config.static_budget if root == obj.root else config.part_budget
-        visuals = obj.group_visuals(root)
-        hulls[root] = decompose(visuals, budget, config, config.seed)
-        if visuals:
-            match = fidelity(visuals, hulls[root], config.seed)
-            groups[root] = {"hulls": len(hulls[root]), "budget": budget, **asdict(match)}
+        hulls[root] = []
+        if visuals := obj.group_visuals(root):
+            surface = Surface(visuals, config.seed)
+            hulls[root] = decompose(surface, budget, config)
+            groups[root] = {
+                "hulls": len(hulls[root]), "budget": budget, **asdict(fidelity(surface, hulls[root])),
+            }  # fmt: skip
     split = split or default_split(obj.category, obj.id)
     converted = ConvertedObject(obj, hulls, parts, left_out, split)
     mjcf = to_mjcf(converted, config)
@@ -233,7 +238,7 @@ def _banks(
 
     Returns the key of what was made, and why Scenes have no views.
     """
-    key = hashlib.sha256(json.dumps([FORMAT, asdict(config), sorted(current.items())]).encode()).hexdigest()
+    key = hashlib.sha256(json.dumps([asdict(config), sorted(current.items())]).encode()).hexdigest()
     if key == made.get("key") and all((out / f).is_file() for f in ("splits.json", "scenes.npz", "views.npz")):
         return made
     objects = [ConvertedObject.load(out / name) for name in sorted(current)]

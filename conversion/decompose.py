@@ -56,14 +56,9 @@ class Fidelity:
     phantom_share: float  # share of the hull surface that lies farther than 0.02 from it
 
 
-def decompose(visuals: Sequence[Visual], budget: int, config: DecomposeConfig, seed: int = 0) -> list[Hull]:
-    """Convex hulls of one rigid group, at most `budget` where merging can reach it.
-
-    visuals: all in one frame. Handles are merged with handles only. Same input, same hulls.
-    """
-    if not visuals:
-        return []
-    surface = Surface(visuals, seed)
+def decompose(surface: Surface, budget: int, config: DecomposeConfig) -> list[Hull]:
+    """Convex hulls of one rigid group, at most `budget` of them. Handles are merged with handles only."""
+    visuals = surface.visuals
     pieces: dict[bool, list[_Piece]] = {False: [], True: []}
     for visual in visuals:
         if len(visuals) > 1 and surface.hidden(visual):
@@ -84,6 +79,7 @@ class Surface:
     """
 
     def __init__(self, visuals: Sequence[Visual], seed: int = 0):
+        self.visuals = visuals
         self.rng = np.random.default_rng(seed)
         start = np.cumsum([0] + [len(v.vertices) for v in visuals])
         vertices = np.concatenate([v.vertices for v in visuals])
@@ -104,12 +100,11 @@ class Surface:
         occupied = np.zeros(self.shape, bool)
         occupied[tuple(self._cell(np.concatenate([dense, vertices])).T)] = True
         free = np.zeros(self.shape, np.int32)
-        ndimage.label(~ndimage.binary_dilation(occupied), output=free)
+        ndimage.label(np.logical_not(ndimage.binary_dilation(occupied)), output=free)
         reached = free == free[0, 0, 0]
         self.layer = np.full(self.shape, 4, np.uint8)  # voxels between a cell and the space outside, 4 = further in
         for k in (3, 2, 1, 0):
-            grown = ndimage.binary_dilation(reached, iterations=k) if k else reached
-            self.layer[np.asarray(grown)] = k
+            self.layer[np.asarray(ndimage.binary_dilation(reached, iterations=k) if k else reached, bool)] = k
 
     def _sample(self, triangles: np.ndarray, n: int) -> tuple[np.ndarray, np.ndarray]:
         return sample(triangles, n, self.rng)
@@ -128,21 +123,24 @@ class Surface:
 
     def distance(self, points: np.ndarray) -> np.ndarray:
         """Distance [n] to the surface, at most MAX_DISTANCE; exact for the triangles of the four nearest samples."""
-        near, index = map(np.asarray, self.tree.query(points, k=4, distance_upper_bound=MAX_DISTANCE))
-        best = np.minimum(near[:, 0], MAX_DISTANCE)
-        rows = np.flatnonzero(near[:, 0] < MAX_DISTANCE)
-        for column in np.minimum(index[rows], len(self.owner) - 1).T:
-            best[rows] = np.minimum(best[rows], _point_triangle(points[rows], self.triangles[self.owner[column]]))
-        return best
+        return self._refined(points, *self._nearest(points), 0.0)
 
-    def phantom(self, points: np.ndarray, refine_above: float = 0.003) -> np.ndarray:
+    def phantom(self, points: np.ndarray) -> np.ndarray:
         """Distance [n] of points in reachable space to the surface, at most MAX_DISTANCE, 0 for points inside."""
-        d = np.minimum(self.tree.query(points, distance_upper_bound=MAX_DISTANCE)[0], MAX_DISTANCE)
-        d[(d > 1.8 * self.voxel) & (self.layers(points) > 0)] = 0
-        far = d > refine_above
-        if far.any():
-            d[far] = self.distance(points[far])
-        return d
+        near, index = self._nearest(points)
+        near[(near > 1.8 * self.voxel) & (self.layers(points) > 0)] = 0
+        return self._refined(points, near, index, 0.003)
+
+    def _nearest(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Distance [n] to the nearest sample, and the triangles [n, 4] of the nearest four."""
+        near, index = map(np.asarray, self.tree.query(points, k=4, distance_upper_bound=MAX_DISTANCE))
+        return np.minimum(near[:, 0], MAX_DISTANCE), self.owner[np.minimum(index, len(self.owner) - 1)]
+
+    def _refined(self, points: np.ndarray, near: np.ndarray, index: np.ndarray, above: float) -> np.ndarray:
+        rows = np.flatnonzero((near > above) & (near < MAX_DISTANCE))
+        exact = _point_triangle(np.repeat(points[rows], 4, axis=0), self.triangles[index[rows].ravel()])
+        near[rows] = np.minimum(near[rows], exact.reshape(-1, 4).min(axis=1)) if len(rows) else near[rows]
+        return near
 
     def worst(self, piece: _Piece, n: int) -> float:
         """Largest phantom of n samples of a hull. Where it is not itself a handle's, free space beside a handle counts
@@ -177,8 +175,9 @@ def sample(triangles: np.ndarray, n: int, rng: np.random.Generator) -> tuple[np.
 
 
 def _areas(triangles: np.ndarray) -> np.ndarray:
-    a, b, c = triangles.transpose(1, 0, 2)
-    return np.linalg.norm(np.cross(b - a, c - a), axis=1) / 2
+    u, v = triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0]
+    uu, vv, uv = (np.einsum("ij,ij->i", x, y) for x, y in ((u, u), (v, v), (u, v)))
+    return np.sqrt(np.maximum(uu * vv - uv**2, 0)) / 2
 
 
 def _point_triangle(p: np.ndarray, triangles: np.ndarray) -> np.ndarray:
@@ -438,13 +437,15 @@ def _merge(pieces: list[_Piece], surface: Surface, free: float, budget: int, con
     active = dict(enumerate(kept))
     heap: list[tuple[float, int, int, _Piece]] = []
 
-    def meet(i: int, j: int) -> None:
-        merged = active[i].joined(active[j], config.thickness)
-        heapq.heappush(heap, (surface.harm(merged, free), i, j, merged))
+    def meet(i: int, others: list[int]) -> None:
+        low, high = active[i].bounds
+        apart = [np.maximum(active[j].bounds[0] - high, low - active[j].bounds[1]).max() for j in others]
+        for k in np.argsort(apart, kind="stable")[:12].tolist():
+            merged = active[i].joined(active[others[k]], config.thickness)
+            heapq.heappush(heap, (surface.harm(merged, free), i, others[k], merged))
 
     for i in active:
-        for j in range(i):
-            meet(i, j)
+        meet(i, list(range(i)))
     number = len(kept)
     while len(active) > budget:
         _, i, j, merged = heapq.heappop(heap)
@@ -453,10 +454,9 @@ def _merge(pieces: list[_Piece], surface: Surface, free: float, budget: int, con
         del active[i], active[j]
         for k in [k for k, p in active.items() if merged.holds(p)]:
             del active[k]
+        others = list(active)
         active[number] = merged
-        for k in active:
-            if k != number:
-                meet(number, k)
+        meet(number, others)
         number += 1
     return list(active.values())
 
@@ -478,9 +478,8 @@ def _absorb(pieces: list[_Piece], surface: Surface, target: int, config: Decompo
     return pieces
 
 
-def fidelity(visuals: Sequence[Visual], hulls: Sequence[Hull], seed: int = 0) -> Fidelity:
-    """Gap and phantom of the hulls of one group; visuals and hulls in one frame."""
-    surface = Surface(visuals, seed + 1)
+def fidelity(surface: Surface, hulls: Sequence[Hull]) -> Fidelity:
+    """Gap and phantom of the hulls of one group, by samples of their own."""
     pieces = [_Piece.of(h.vertices, 1e-6) for h in hulls]
     points, _ = sample(surface.triangles, 20_000, surface.rng)
     points = points[surface.layers(points) <= 2]
@@ -498,7 +497,7 @@ def fidelity(visuals: Sequence[Visual], hulls: Sequence[Hull], seed: int = 0) ->
         skin.append(on)
     on = np.concatenate(skin) if skin else np.zeros((0, 3))
     on = on[surface.layers(on) <= 2]
-    phantom = surface.phantom(on, 0.0) if len(on) else np.zeros(1)
+    phantom = surface.phantom(on) if len(on) else np.zeros(1)
     return Fidelity(
         float(np.percentile(gap, 95)),
         float(gap.max()),
