@@ -62,9 +62,11 @@ class CPhysics:
         with self._lock:
             pool = self._pool(len(scene))
             pool.load(np.arange(len(scene)), scene, pose, exact)
-            pool.batch.forward(stage=mujoco.mjtStage.mjSTAGE_POS.value)
+            with _silent():
+                pool.batch.forward(stage=mujoco.mjtStage.mjSTAGE_POS.value)
             contact = pool.contacts > 0
-        return self._pack(batch, exact, contact, ~np.isfinite(exact).all(1))
+        finite = np.isfinite(exact).all(1) & np.isfinite(pose).all(1)
+        return self._pack(batch, exact, contact, ~finite)
 
     def _rollout(self, state, ctrl, active):
         batch = np.shape(state.scene)
