@@ -209,7 +209,7 @@ def begin(key: jax.Array, config: PerceptionConfig) -> PerceptionState:
     """Fresh networks. Consumes the key."""
     key, init = jax.random.split(key)
     params = Networks(config.networks).init(init)
-    return PerceptionState(params, _optimizer(config).init(params), jnp.int32(0), jax.random.key_data(key))
+    return PerceptionState(params, _moments(config, params), jnp.int32(0), jax.random.key_data(key))
 
 
 def train(
@@ -231,7 +231,7 @@ def train(
         raise ValueError(f"nothing to train the {stage} stage on: the buffer has no samples")
     done = int(state.step)
     if done == 0:  # the moments of the last stage belong to other losses
-        state = replace(state, optimizer=_optimizer(config).init(state.params))
+        state = replace(state, optimizer=_moments(config, state.params))
     while done < steps:
         count = min(config.steps_per_call, steps - done)
         state, sums = _steps(config, stage, state, clouds, samples, index, count, steps)
@@ -451,9 +451,14 @@ def _trained(config: PerceptionConfig, stage: str) -> set[str]:
 
 
 def _optimizer(config: PerceptionConfig) -> optax.GradientTransformation:
-    return optax.chain(
-        optax.clip_by_global_norm(1.0), optax.scale_by_adam(), optax.add_decayed_weights(config.weight_decay)
-    )
+    decay = optax.add_decayed_weights(config.weight_decay)
+    # As one vector: an update per parameter compiles twice as long.
+    return optax.flatten(optax.chain(optax.clip_by_global_norm(1.0), optax.scale_by_adam(), decay))
+
+
+@partial(jax.jit, static_argnames=("config",))
+def _moments(config: PerceptionConfig, params: Params) -> optax.OptState:
+    return _optimizer(config).init(params)
 
 
 def _learning_rate(config: PerceptionConfig, step: jax.Array, steps: int) -> jax.Array:

@@ -13,6 +13,7 @@ from vatmart_jax import geometry as g
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
+from matplotlib import patheffects
 
 _STAGE_CURVES = (
     ("explore", ("success", "reward")),
@@ -41,6 +42,7 @@ def curves(metrics: Path, out: Path) -> None:
         axis.grid(alpha=0.3)
     for axis in np.ravel(axes)[len(panels) :]:
         axis.axis("off")
+    figure.tight_layout()
     _save(figure, out)
 
 
@@ -88,17 +90,19 @@ def priors(
         *flat[part_mask].T, s=12, c=actionability[part_mask], cmap="turbo", vmin=0, vmax=1, linewidths=0
     )
     figure.colorbar(heat, ax=axis, shrink=0.75, label="actionability")
-    for rank, (trajectory, score) in reversed(list(enumerate(zip(trajectories, scores, strict=True)))):
+    outlined = [patheffects.withStroke(linewidth=4, foreground="white")]
+    for rank, (trajectory, score) in enumerate(zip(trajectories, scores, strict=True)):
         tips, frames = waypoints(trajectory, contact, standoff)
-        color = "#d81b60" if rank == 0 else "#5c6bc0"
-        path = project(tips)
+        color, width = ("#111111", 2.4) if rank == 0 else ("#8e24aa", 1.4)
         label = f"score {score:.2f}"
-        axis.plot(*path.T, "-o", color=color, lw=2.2 if rank == 0 else 1.2, ms=3.5, label=label, zorder=5 - rank)
-        hand = project(np.stack([tips, tips - 0.1 * frames[:, :, 2]], 1).reshape(-1, 3)).reshape(-1, 2, 2)
+        style = {"color": color, "path_effects": outlined, "zorder": 9 - rank}
+        axis.plot(*project(tips).T, "-o", lw=width, ms=4, label=label, **style)
+        # A short stroke at every waypoint shows where the hand is.
+        hand = project(np.stack([tips, tips - 0.08 * frames[:, :, 2]], 1).reshape(-1, 3)).reshape(-1, 2, 2)
         for segment in hand:
-            axis.plot(*segment.T, color=color, lw=1, alpha=0.7, zorder=5 - rank)
-    axis.plot(*project(contact), "k*", ms=11, zorder=6)
-    axis.legend(loc="lower right", fontsize=8)
+            axis.plot(*segment.T, lw=1, color=color, alpha=0.6, zorder=8 - rank)
+    axis.plot(*project(contact), "*", color="#d50000", ms=13, mec="white", zorder=10)
+    axis.legend(loc="upper left", bbox_to_anchor=(0, 0), ncols=3, fontsize=8, frameon=False)
     axis.set_aspect("equal")
     axis.axis("off")
     axis.set_title(title, fontsize=10)
