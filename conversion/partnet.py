@@ -10,7 +10,7 @@ import io
 import json
 import re
 import zipfile
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -21,6 +21,7 @@ import trimesh
 import yourdfpy
 from scipy.spatial import ConvexHull, QhullError
 from scipy.spatial.transform import Rotation
+from trimesh.ray.ray_pyembree import RayMeshIntersector
 
 from vatmart_jax.errors import UserError
 
@@ -562,7 +563,7 @@ def clean(vertices: np.ndarray, faces: np.ndarray, merge: float = 1e-5) -> tuple
 def parts(obj: PartNetObject) -> tuple[list[Part], list[tuple[str, str]]]:
     """The doors and drawers of an object, and every other moving joint with the reason why it is none."""
     found, left_out = [], []
-    size = max(np.ptp(np.concatenate(_posed_vertices(obj, obj.links)), axis=0).max(), 1e-9)
+    size = max(np.ptp(_posed(obj, obj.links).reshape(-1, 3), axis=0).max(), 1e-9)
     for link, joint in obj.joints.items():
         if joint.type == "fixed":
             continue
@@ -600,33 +601,63 @@ def _no_part(obj: PartNetObject, joint: Joint, size: float) -> str:
     return ""
 
 
-def _posed_vertices(obj: PartNetObject, links, values: Mapping[str, float] | None = None) -> list[np.ndarray]:
+def _posed(obj: PartNetObject, links: Iterable[str], values: Mapping[str, float] | None = None) -> np.ndarray:
+    """Triangles [m, 3, 3] of links in the object frame."""
     poses = obj.link_poses(values)
-    return [
-        v.vertices @ poses[name][:3, :3].T + poses[name][:3, 3] for name in links for v in obj.links[name].visuals
-    ] or [np.zeros((0, 3))]
+    triangles = [
+        (v.vertices @ poses[name][:3, :3].T + poses[name][:3, 3])[v.faces]
+        for name in links
+        for v in obj.links[name].visuals
+    ]
+    return np.concatenate([np.zeros((0, 3, 3)), *triangles])
 
 
 def _closed_value(obj: PartNetObject, joint: Joint) -> float:
     """The joint value at which the part is closed.
 
-    The dataset models most objects closed, at 0. Where 0 is not an end of the range, the part may have been modelled
-    ajar: it is closed where it stands out least from the hull of what does not move with it.
+    That is where it stands out least from the hull of what it is mounted on and, of the values at which it hardly does
+    (a flap can also hang down outside), where it covers most of the way from inside to outside. The dataset models
+    most objects closed, at 0: where that is an end of the range, the other end must be closed much better.
     """
-    slack = 1e-3 * (joint.upper - joint.lower)
-    for end in (joint.lower, joint.upper):
-        if abs(end) <= slack:
-            return end
+    zero = float(np.clip(0.0, joint.lower, joint.upper))
+    at_end = min(zero - joint.lower, joint.upper - zero) <= 1e-3 * (joint.upper - joint.lower)
+    candidates = sorted({joint.lower, joint.upper} if at_end else {joint.lower, joint.upper, zero}, key=abs)
     moving = obj.subtree(joint.child)
-    rest = np.concatenate(_posed_vertices(obj, [n for n in obj.links if n not in moving]))
+    # What it hangs on and the static group: other drawers may be ajar as well.
+    carriers, link = {obj.root}, joint.parent
+    while link in obj.joints:
+        link = obj.group_root(link)
+        carriers.add(link)
+        link = obj.joints[link].parent if link in obj.joints else link
+    rest = _posed(obj, [n for n in obj.links if obj.group_root(n) in carriers and n not in moving])
     try:
-        equations = ConvexHull(rest).equations
+        equations = ConvexHull(rest.reshape(-1, 3)).equations
     except (QhullError, ValueError):
-        return float(np.clip(0.0, joint.lower, joint.upper))
-    candidates = {joint.lower, joint.upper, float(np.clip(0.0, joint.lower, joint.upper))}
+        return candidates[0]
+    own = obj.groups[joint.child]
+    posed = [_posed(obj, own, {joint.name: value}) for value in candidates]
+    size = np.ptp(rest.reshape(-1, 3), axis=0).max()
+    depth = lambda points: (points @ equations[:, :3].T + equations[:, 3]).max(axis=1)  # noqa: E731
+    out = np.array([np.maximum(depth(p.reshape(-1, 3)), 0).mean() for p in posed]) / size
+    slack = 0.05 if at_end and candidates[0] == zero else 0.005 if joint.type == "prismatic" else 0.03
+    near = [k for k in range(len(candidates)) if out[k] <= out.min() + slack]
+    if joint.type == "prismatic" or len(near) == 1 or (at_end and near[0] == 0):
+        return candidates[near[0]]
 
-    def stands_out(value: float) -> float:
-        points = np.concatenate(_posed_vertices(obj, moving, {joint.name: value}))
-        return float(np.maximum((points @ equations[:, :3].T + equations[:, 3]).max(axis=1), 0).mean())
+    rng = np.random.default_rng(0)
+    low, high = rest.reshape(-1, 3).min(axis=0), rest.reshape(-1, 3).max(axis=0)
+    inside = rng.uniform(low, high, (4000, 3))
+    inside = inside[depth(inside) < -0.05 * size][:1000]
+    starts, ways = np.repeat(inside, 4, axis=0), rng.normal(size=(4 * len(inside), 3))
+    free = ~_hit(rest, starts, ways)
+    covered = [_hit(p, starts[free], ways[free]).sum() / max(len(starts), 1) for p in posed]
+    return candidates[max(near, key=lambda k: (round(covered[k], 2), -round(100 * out[k]), -k))]
 
-    return min(sorted(candidates, key=abs), key=lambda v: round(stands_out(v), 3))
+
+def _hit(triangles: np.ndarray, origins: np.ndarray, directions: np.ndarray) -> np.ndarray:
+    """Which rays [n] meet any of the triangles [m, 3, 3]."""
+    if not (len(triangles) and len(origins)):
+        return np.zeros(len(origins), bool)
+    faces = np.arange(3 * len(triangles)).reshape(-1, 3)
+    mesh = trimesh.Trimesh(triangles.reshape(-1, 3), faces, process=False)
+    return np.asarray(RayMeshIntersector(mesh).intersects_any(origins, directions))
