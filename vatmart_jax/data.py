@@ -15,7 +15,7 @@ from vatmart_jax.env import Env, EnvConfig, Task
 from vatmart_jax.errors import UserError
 from vatmart_jax.physics import PhysicsConfig
 
-BUNDLED_COUNT, BUNDLED_SEED = 60, 0
+BUNDLED_COUNT, BUNDLED_SEED = 50, 0
 SPLITS = ("train", "test_shapes", "test_categories")
 
 

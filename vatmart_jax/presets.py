@@ -64,7 +64,7 @@ class Settings:
 
 PRESETS = {
     "quick": Settings(
-        explore=ExploreConfig(iterations=60, pool=2048),
+        explore=ExploreConfig(iterations=90, pool=2048),
         perception=PerceptionConfig(networks=NetworksConfig(pointnet=SMALL), proposals=32),
     ),
     "cpu": Settings(
