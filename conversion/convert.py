@@ -26,12 +26,16 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
 from conversion import partnet
+from conversion.boxes import boxes
+from conversion.budget import joined, within_budget
 from conversion.decompose import DecomposeConfig, Surface, decompose, fidelity
+from conversion.handles import handles
 from conversion.mjcf import MjcfConfig, to_mjcf
 from conversion.partnet import ConvertedObject, ObjectError
-from conversion.report import picture, save_png
+from conversion.report import contact_sheet, page, picture, read_png, save_png
 from conversion.scenes import scene_bank
 from conversion.views import views
+from vatmart_jax.bank import SceneBank
 
 URDF_NAMES = ("mobility.urdf", "mobility_vhacd.urdf")
 TRAIN_CATEGORIES = ("StorageFurniture", "Door", "Microwave", "Refrigerator")  # paper, section 4.1
@@ -41,8 +45,8 @@ _SOURCE_SUFFIXES = (".urdf", ".json", ".txt", ".obj", ".stl", ".ply")
 
 
 @dataclass(frozen=True)
-class BankConfig:
-    """What the banks are made with; changing it leaves converted objects as they are."""
+class ViewConfig:
+    """What views are made with; changing it leaves converted objects as they are."""
 
     views: int = 6
     """Views of every Scene for a push task, and as many for a pull task."""
@@ -50,16 +54,16 @@ class BankConfig:
     """Points per view; the paper has 10,000."""
     contacts: int = 128
     """Further pixels of the moving part per view: where a trial may touch."""
-    variants: int = 2
-    """Scenes per door or drawer: all other parts closed, then with some of them open."""
 
 
 @dataclass(frozen=True)
-class ConvertConfig(DecomposeConfig, MjcfConfig, BankConfig):
+class ConvertConfig(DecomposeConfig, MjcfConfig, ViewConfig):
     part_budget: int = 16
-    """Hulls per moving link."""
+    """Hulls per moving link; in a Scene, of all that moves with its part."""
     static_budget: int = 32
-    """Hulls of all that is fixed to the world."""
+    """Hulls of all that is fixed to the world; in a Scene, of all that stands still."""
+    variants: int = 2
+    """Scenes per door or drawer: all other parts closed, then with some of them open."""
     allow_missing: bool = False
     """Convert objects with missing meshes, without them."""
     continuous_range: bool = False
@@ -122,7 +126,7 @@ def convert(sources: Sequence[Path], out: Path, config: ConvertConfig, jobs: int
             out.rmdir()
         more = f" (and {len(failures) - 1} more objects refused)" if len(failures) > 1 else ""
         raise ObjectError(failures[0]["reason"] + more)
-    banks = _banks(out, current, config, jobs, record.get("banks", {}))
+    banks = _banks(out, current, failures, config, jobs, record.get("banks", {}))
     settings = {"config": asdict(config), "versions": _versions(), "failed": failures, "banks": banks}
     _write_json(out / "convert.json", settings)
     reasons = [{"id": f["id"], "reason": f["reason"]} for f in failures]
@@ -145,10 +149,10 @@ def _object_folders(sources: Sequence[Path], out: Path) -> list[Path]:
 
 def _key(folder: Path, config: ConvertConfig, split: str | None) -> str:
     """Hash of all that a conversion depends on."""
-    of_banks = {f.name for f in fields(BankConfig)}
-    settings = {name: value for name, value in asdict(config).items() if name not in of_banks | {"time_limit"}}
+    others = {f.name for f in fields(ViewConfig)} | {"time_limit"}
+    settings = {name: value for name, value in asdict(config).items() if name not in others}
     digest = hashlib.sha256(json.dumps([settings, split, _versions()], sort_keys=True).encode())
-    for function in (partnet.read_object, decompose, to_mjcf):
+    for function in (partnet.read_object, decompose, boxes, to_mjcf, scene_bank, within_budget, handles):
         digest.update(inspect.getsource(sys.modules[function.__module__]).encode())
     for path in sorted(folder.rglob("*")):
         if path.suffix.lower() in _SOURCE_SUFFIXES and path.is_file():
@@ -196,9 +200,9 @@ def _convert_one(folder: Path, out: Path, config: ConvertConfig, split: str | No
         if visuals := obj.group_visuals(root):
             surface = Surface(visuals, config.seed)
             hulls[root] = decompose(surface, budget, config)
-            groups[root] = {
-                "hulls": len(hulls[root]), "budget": budget, **asdict(fidelity(surface, hulls[root])),
-            }  # fmt: skip
+            if config.collision == "box":
+                hulls[root] = boxes(surface, hulls[root], 2 * budget, config)
+            groups[root] = {"hulls": len(hulls[root]), "budget": budget, **asdict(fidelity(surface, hulls[root]))}
     split = split or default_split(obj.category, obj.id)
     converted = ConvertedObject(obj, hulls, parts, left_out, split)
     mjcf = to_mjcf(converted, config)
@@ -206,6 +210,8 @@ def _convert_one(folder: Path, out: Path, config: ConvertConfig, split: str | No
         mjcf.compile()
     except ObjectError as e:
         raise ObjectError(f"{obj.id}: {e}") from None
+    bank = scene_bank([converted], config.variants, config.collision, config.seed)
+    bank, slots = within_budget(bank, converted, config.static_budget, config.part_budget, config, config.seed)
     report = {
         "id": obj.id,
         "category": obj.category,
@@ -215,6 +221,9 @@ def _convert_one(folder: Path, out: Path, config: ConvertConfig, split: str | No
         "left_out": [{"joint": j, "reason": why} for j, why in left_out],
         "notes": obj.notes,
         "groups": groups,
+        "handles": [asdict(h) for h in handles(converted)],
+        "scenes": len(bank),
+        "merged_scenes": [asdict(s) for s in slots],
         "seconds": round(time.process_time() - start, 3),  # of one core
     }
     part = out / f".{obj.id}.part"
@@ -223,6 +232,7 @@ def _convert_one(folder: Path, out: Path, config: ConvertConfig, split: str | No
         part.mkdir()
         mjcf.write(part)
         converted.save(part)
+        bank.save(part / "scenes.npz")
         save_png(part / "picture.png", picture(converted))
         _write_json(part / "report.json", report)
         shutil.rmtree(out / obj.id, ignore_errors=True)
@@ -232,25 +242,38 @@ def _convert_one(folder: Path, out: Path, config: ConvertConfig, split: str | No
 
 
 def _banks(
-    out: Path, current: dict[str, str], config: ConvertConfig, jobs: int, made: dict[str, Any]
+    out: Path,
+    current: dict[str, str],
+    failed: list[dict[str, str]],
+    config: ConvertConfig,
+    jobs: int,
+    made: dict[str, Any],
 ) -> dict[str, Any]:
-    """Write splits.json, scenes.npz and views.npz of the current objects, unless `made` (returned earlier) fits them.
+    """Write what describes the current objects together, unless `made` (returned earlier) fits them.
 
-    Returns the key of what was made, and why Scenes have no views.
+    That is splits.json, scenes.npz, views.npz, report.html and contact_sheet.png. Returns the key of what was made, and
+    why Scenes have no views.
     """
-    key = hashlib.sha256(json.dumps([asdict(config), sorted(current.items())]).encode()).hexdigest()
-    if key == made.get("key") and all((out / f).is_file() for f in ("splits.json", "scenes.npz", "views.npz")):
+    key = hashlib.sha256(json.dumps([asdict(config), sorted(current.items()), failed]).encode()).hexdigest()
+    files = ("splits.json", "scenes.npz", "views.npz", "report.html", "contact_sheet.png")
+    if key == made.get("key") and all((out / f).is_file() for f in files):
         return made
-    objects = [ConvertedObject.load(out / name) for name in sorted(current)]
+    names = sorted(current)
+    objects = [ConvertedObject.load(out / name) for name in names]
     table: dict[str, dict[str, list[str]]] = {split: {} for split in SPLITS}
     for o in objects:
         table[o.split].setdefault(o.obj.category, []).append(o.obj.id)
-    bank = scene_bank(objects, config.variants, config.collision, config.seed)
-    found, without = views(objects, bank, config.views, config.points, config.contacts, config.seed, jobs)
     _write_json(out / "splits.json", table)
-    bank.save(out / "scenes.npz")
+    joined([SceneBank.load(out / name / "scenes.npz") for name in names]).save(out / "scenes.npz")
+    links = scene_bank(objects, config.variants, config.collision, config.seed)
+    found, without = views(objects, links, config.views, config.points, config.contacts, config.seed, jobs)
     found.save(out / "views.npz")
-    return {"key": key, "without_views": [why for _, why in without]}
+    without_views = [why for _, why in without]
+    reports = [_read_json(out / name / "report.json") for name in names]
+    _write_text(out / "report.html", page(reports, failed, without_views))
+    pictures = [read_png(out / name / "picture.png") for name in names]
+    save_png(out / "contact_sheet.png", contact_sheet(pictures, max(1, round(len(pictures) ** 0.5 / 2))))
+    return {"key": key, "without_views": without_views}
 
 
 def _pool(
@@ -319,14 +342,18 @@ def _serve(function: Callable[..., None], pipe: Connection) -> None:
             task = pipe.recv()
         except EOFError:
             return
+        error = None
         try:
             function(*task)
-            pipe.send(None)
         except ObjectError as e:
-            pipe.send(str(e))
+            error = str(e)
         except Exception as e:  # whatever one object does, the others go on
             where = traceback.extract_tb(e.__traceback__)[-1]
-            pipe.send(f"{task[0].name}: {type(e).__name__}: {e} ({Path(where.filename).name}:{where.lineno})")
+            error = f"{task[0].name}: {type(e).__name__}: {e} ({Path(where.filename).name}:{where.lineno})"
+        try:
+            pipe.send(error)
+        except BrokenPipeError:  # the other end was killed
+            return
 
 
 def _read_json(path: Path) -> dict[str, Any]:
@@ -339,6 +366,10 @@ def _read_json(path: Path) -> dict[str, Any]:
 
 
 def _write_json(path: Path, data: Any) -> None:
+    _write_text(path, json.dumps(data, indent=1))
+
+
+def _write_text(path: Path, text: str) -> None:
     part = path.with_name(path.name + ".part")
-    part.write_text(json.dumps(data, indent=1))
+    part.write_text(text)
     part.replace(path)

@@ -59,16 +59,36 @@ class Fidelity:
 def decompose(surface: Surface, budget: int, config: DecomposeConfig) -> list[Hull]:
     """Convex hulls of one rigid group, at most `budget` of them. Handles are merged with handles only."""
     visuals = surface.visuals
-    pieces: dict[bool, list[_Piece]] = {False: [], True: []}
+    pieces: list[_Piece] = []
     for visual in visuals:
-        if len(visuals) > 1 and surface.hidden(visual):
-            continue
-        pieces[visual.is_handle] += _leaf(visual, surface, config)
-    handles = _merge(pieces[True], surface, config.merge_tolerance / 2, max(4, budget // 2), config)
-    others = _merge(pieces[False], surface, config.merge_tolerance, max(1, budget - len(handles)), config)
-    return [Hull(_few_vertices(p.points, config)[0], False) for p in others] + [
-        Hull(_few_vertices(p.points, config)[0], True) for p in handles
-    ]
+        if len(visuals) == 1 or not surface.hidden(visual):
+            pieces += _leaf(visual, surface, config)
+    return [Hull(_few_vertices(p.points, config)[0], p.is_handle) for p in _within(pieces, surface, budget, config)]
+
+
+def merged(
+    surface: Surface, hulls: Sequence[Hull], budget: int, config: DecomposeConfig
+) -> tuple[list[int], list[Hull]]:
+    """Hulls of several groups as at most `budget`: which of them stay as they are, and new ones for others.
+
+    Those that nothing outside reaches are dropped.
+    """
+    pieces = [_Piece.of(h.vertices, config.thickness / 2, h.is_handle) for h in hulls]
+    number = {id(p): i for i, p in enumerate(pieces)}
+    kept, new = [], []
+    for piece in _within(pieces, surface, budget, config):
+        if id(piece) in number:
+            kept.append(number[id(piece)])
+        else:
+            new.append(Hull(_few_vertices(piece.points, config)[0], piece.is_handle))
+    return sorted(kept), new
+
+
+def _within(pieces: list[_Piece], surface: Surface, budget: int, config: DecomposeConfig) -> list[_Piece]:
+    handles = [p for p in pieces if p.is_handle]
+    others = [p for p in pieces if not p.is_handle]
+    handles = _merge(handles, surface, config.merge_tolerance / 2, max(4, budget // 2), config)
+    return _merge(others, surface, config.merge_tolerance, max(1, budget - len(handles)), config) + handles
 
 
 class Surface:
@@ -86,7 +106,7 @@ class Surface:
         self.triangles = np.concatenate([v.vertices[v.faces] for v in visuals])  # [m, 3, 3]
         area = float(_areas(self.triangles).sum())
         spacing = float(np.clip(np.sqrt(area / 20_000), 0.0015, 0.008))
-        points, owner = self._sample(self.triangles, int(np.clip(area / spacing**2, 500, 150_000)))
+        points, owner = self.sample(self.triangles, int(np.clip(area / spacing**2, 500, 150_000)))
         points = np.concatenate([points, self.triangles.mean(axis=1)])
         self.owner = np.concatenate([owner, np.arange(len(self.triangles))])
         self.tree = KDTree(points)
@@ -96,7 +116,7 @@ class Surface:
         self.voxel = max(0.008, float((high - low).max()) / 160)
         self.low = low - 4 * self.voxel
         self.shape = np.ceil((high - low) / self.voxel).astype(int) + 9
-        dense, _ = self._sample(self.triangles, int(np.clip(4 * area / self.voxel**2, 2000, 600_000)))
+        dense, _ = self.sample(self.triangles, int(np.clip(4 * area / self.voxel**2, 2000, 600_000)))
         occupied = np.zeros(self.shape, bool)
         occupied[tuple(self._cell(np.concatenate([dense, vertices])).T)] = True
         free = np.zeros(self.shape, np.int32)
@@ -106,8 +126,14 @@ class Surface:
         for k in (3, 2, 1, 0):
             self.layer[np.asarray(ndimage.binary_dilation(reached, iterations=k) if k else reached, bool)] = k
 
-    def _sample(self, triangles: np.ndarray, n: int) -> tuple[np.ndarray, np.ndarray]:
-        return sample(triangles, n, self.rng)
+    def sample(self, triangles: np.ndarray, n: int) -> tuple[np.ndarray, np.ndarray]:
+        """n points [n, 3] spread evenly over triangles [m, 3, 3], and the triangle [n] of each."""
+        area = np.cumsum(_areas(triangles))
+        owner = np.searchsorted(area, (np.arange(n) + self.rng.random()) / n * area[-1]).clip(0, len(triangles) - 1)
+        uv = self.rng.random((n, 2))
+        uv[uv.sum(axis=1) > 1] = 1 - uv[uv.sum(axis=1) > 1]
+        a, b, c = triangles[owner].transpose(1, 0, 2)
+        return a + uv[:, :1] * (b - a) + uv[:, 1:] * (c - a), owner
 
     def _cell(self, points: np.ndarray) -> np.ndarray:
         return np.clip(((points - self.low) / self.voxel).astype(int), 0, self.shape - 1)
@@ -118,7 +144,7 @@ class Surface:
 
     def hidden(self, visual: Visual) -> bool:
         """Nothing outside can touch this visual."""
-        points, _ = self._sample(visual.vertices[visual.faces], 200)
+        points, _ = self.sample(visual.vertices[visual.faces], 200)
         return bool((self.layers(np.concatenate([points, visual.vertices])) > 3).all())
 
     def distance(self, points: np.ndarray) -> np.ndarray:
@@ -145,7 +171,7 @@ class Surface:
     def worst(self, piece: _Piece, n: int) -> float:
         """Largest phantom of n samples of a hull. Where it is not itself a handle's, free space beside a handle counts
         double: fingers go there."""
-        points = np.concatenate([self._sample(piece.triangles, n)[0], piece.triangles.mean(axis=1)])
+        points = np.concatenate([self.sample(piece.triangles, n)[0], piece.triangles.mean(axis=1)])
         d = self.phantom(points)
         if self.handles is not None and not piece.is_handle:
             far = d > 0.003
@@ -154,24 +180,14 @@ class Surface:
 
     def harm(self, piece: _Piece, free: float) -> float:
         """Hull area times how much farther than `free` it reaches into free space: what a forced merge costs."""
-        points, _ = self._sample(piece.triangles, 100)
+        points, _ = self.sample(piece.triangles, 100)
         excess = np.maximum(self.phantom(points) - free, 0)
         # The longest way counts a little, so that of merges without harm the compact one comes first.
         return float(excess.mean() * _areas(piece.triangles).sum() + 1e-6 * np.ptp(piece.points, axis=0).max())
 
     def reachable(self, piece: _Piece) -> bool:
-        points, _ = self._sample(piece.triangles, 100)
+        points, _ = self.sample(piece.triangles, 100)
         return bool((self.layers(np.concatenate([points, piece.points])) <= 3).any())
-
-
-def sample(triangles: np.ndarray, n: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-    """n points [n, 3] spread evenly over triangles [m, 3, 3], and the triangle [n] of each."""
-    area = np.cumsum(_areas(triangles))
-    owner = np.searchsorted(area, (np.arange(n) + rng.random()) / n * area[-1]).clip(0, len(triangles) - 1)
-    uv = rng.random((n, 2))
-    uv[uv.sum(axis=1) > 1] = 1 - uv[uv.sum(axis=1) > 1]
-    a, b, c = triangles[owner].transpose(1, 0, 2)
-    return a + uv[:, :1] * (b - a) + uv[:, 1:] * (c - a), owner
 
 
 def _areas(triangles: np.ndarray) -> np.ndarray:
@@ -481,7 +497,7 @@ def _absorb(pieces: list[_Piece], surface: Surface, target: int, config: Decompo
 def fidelity(surface: Surface, hulls: Sequence[Hull]) -> Fidelity:
     """Gap and phantom of the hulls of one group, by samples of their own."""
     pieces = [_Piece.of(h.vertices, 1e-6) for h in hulls]
-    points, _ = sample(surface.triangles, 20_000, surface.rng)
+    points, _ = surface.sample(surface.triangles, 20_000)
     points = points[surface.layers(points) <= 2]
     gap = np.full(len(points), np.inf)
     for piece in pieces:
@@ -490,7 +506,7 @@ def fidelity(surface: Surface, hulls: Sequence[Hull]) -> Fidelity:
     area = np.array([_areas(p.triangles).sum() for p in pieces])
     skin = []
     for i, piece in enumerate(pieces):
-        on, _ = sample(piece.triangles, int(np.clip(12_000 * area[i] / area.sum(), 60, 6000)), surface.rng)
+        on, _ = surface.sample(piece.triangles, int(np.clip(12_000 * area[i] / area.sum(), 60, 6000)))
         for k, other in enumerate(pieces):
             if k != i and (other.bounds[0] < piece.bounds[1]).all() and (other.bounds[1] > piece.bounds[0]).all():
                 on = on[other.outside(on) > -1e-4]

@@ -615,8 +615,8 @@ def _posed(obj: PartNetObject, links: Iterable[str], values: Mapping[str, float]
 def _closed_value(obj: PartNetObject, joint: Joint) -> float:
     """The joint value at which the part is closed.
 
-    That is where it stands out least from the hull of what it is mounted on and, of the values at which it hardly does
-    (a flap can also hang down outside), where it covers most of the way from inside to outside. The dataset models
+    That is where it is least off the hull of what it is mounted on and, of the values at which it hardly is (a flap
+    can also hang down outside), where it covers most of the way from inside to outside. The dataset models
     most objects closed, at 0: where that is an end of the range, the other end must be closed much better.
     """
     zero = float(np.clip(0.0, joint.lower, joint.upper))
@@ -638,10 +638,13 @@ def _closed_value(obj: PartNetObject, joint: Joint) -> float:
     posed = [_posed(obj, own, {joint.name: value}) for value in candidates]
     size = np.ptp(rest.reshape(-1, 3), axis=0).max()
     depth = lambda points: (points @ equations[:, :3].T + equations[:, 3]).max(axis=1)  # noqa: E731
-    out = np.array([np.maximum(depth(p.reshape(-1, 3)), 0).mean() for p in posed]) / size
-    slack = 0.05 if at_end and candidates[0] == zero else 0.005 if joint.type == "prismatic" else 0.03
+    # A drawer belongs inside the hull, a door on it: it may also swing inwards.
+    off = (lambda d: np.maximum(d, 0)) if joint.type == "prismatic" else np.abs
+    out = np.array([off(depth(p.reshape(-1, 3))).mean() for p in posed]) / size
+    at_zero = at_end and candidates[0] == zero
+    slack = 0.05 if at_zero else 0.005 if joint.type == "prismatic" else 0.03
     near = [k for k in range(len(candidates)) if out[k] <= out.min() + slack]
-    if joint.type == "prismatic" or len(near) == 1 or (at_end and near[0] == 0):
+    if joint.type == "prismatic" or near == [0] or (at_zero and near[0] == 0):
         return candidates[near[0]]
 
     rng = np.random.default_rng(0)
@@ -651,6 +654,8 @@ def _closed_value(obj: PartNetObject, joint: Joint) -> float:
     starts, ways = np.repeat(inside, 4, axis=0), rng.normal(size=(4 * len(inside), 3))
     free = ~_hit(rest, starts, ways)
     covered = [_hit(p, starts[free], ways[free]).sum() / max(len(starts), 1) for p in posed]
+    if at_zero:
+        return candidates[1] if covered[1] >= covered[0] else candidates[0]
     return candidates[max(near, key=lambda k: (round(covered[k], 2), -round(100 * out[k]), -k))]
 
 

@@ -1,0 +1,209 @@
+"""Many objects at once: what one of them does stays its own affair, and nothing is done twice."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import time
+from dataclasses import fields, replace
+from pathlib import Path
+
+import mujoco
+import numpy as np
+import pytest
+
+from conversion.budget import joined, within_budget
+from conversion.convert import ConvertConfig, _pool, convert, default_split
+from conversion.decompose import DecomposeConfig
+from conversion.handles import handles
+from conversion.partnet import ConvertedObject, ObjectError
+from conversion.scenes import scene_bank
+from mjcf_assets.generator import generate
+from vatmart_jax.bank import SceneBank, ViewBank
+
+QUICK = ConvertConfig(views=1, points=64, contacts=16, variants=2)
+
+
+@pytest.fixture(scope="module")
+def source(tmp_path_factory) -> Path:
+    """Four objects, one of them broken, and splits for two."""
+    out = tmp_path_factory.mktemp("source")
+    names = generate(out, 4, seed=5)
+    (out / names[1] / "mobility.urdf").write_text("<robot")
+    (out / "splits.json").write_text(json.dumps({"extra": {"Any": [names[0]]}, "train": {"Any": [names[2]]}}))
+    return out
+
+
+@pytest.fixture(scope="module")
+def result(source, tmp_path_factory):
+    out = tmp_path_factory.mktemp("converted") / "out"
+    return convert([source], out, QUICK, jobs=2), out
+
+
+def objects_in(folder: Path) -> list[str]:
+    return sorted(p.name for p in folder.iterdir() if p.is_dir())
+
+
+def test_a_broken_object_is_listed_and_the_others_are_converted(source, result):
+    outcome, out = result
+    good = [n for n in objects_in(source) if n != outcome.failed[0]["id"]]
+    assert (outcome.objects, outcome.converted, len(outcome.failed)) == (4, 3, 1)
+    assert "mobility.urdf: not XML" in outcome.failed[0]["reason"]
+    assert objects_in(out) == good
+    for name in good:
+        files = {p.name for p in (out / name).iterdir()}
+        assert files == {"assets", "model.xml", "object.npz", "picture.png", "report.json", "scenes.npz"}
+        assert mujoco.MjModel.from_xml_path(str(out / name / "model.xml")).nbody > 1
+    assert not [p for p in out.rglob("*") if p.name.endswith(".part")]
+
+
+def test_banks_hold_every_part_of_every_object(result):
+    _, out = result
+    scenes, views = SceneBank.load(out / "scenes.npz"), ViewBank.load(out / "views.npz")
+    expected = {(n, p.link) for n in objects_in(out) for p in ConvertedObject.load(out / n).parts}
+    assert {*zip(scenes.object_id.tolist(), scenes.part.tolist(), strict=True)} == expected
+    assert len(views) == 2 * len(scenes)
+    assert np.diff(scenes.static_start).max() <= QUICK.static_budget
+    assert np.diff(scenes.part_start).max() <= QUICK.part_budget
+
+
+def test_splits_come_from_the_source_or_the_category(source, result):
+    _, out = result
+    table = json.loads((out / "splits.json").read_text())
+    split = {i: s for s, categories in table.items() for ids in categories.values() for i in ids}
+    given = json.loads((source / "splits.json").read_text())
+    assert split[given["extra"]["Any"][0]] == "extra"
+    assert split[given["train"]["Any"][0]] == "train"
+    rest = next(i for i in split if i not in (given["extra"]["Any"][0], given["train"]["Any"][0]))
+    assert split[rest] == default_split(ConvertedObject.load(out / rest).obj.category, rest)
+
+
+def test_default_splits_follow_the_paper():
+    assert default_split("Safe", "1") == "test_categories"
+    assert default_split("Oven", "1") == "extra"
+    shares = [default_split("Door", str(i)) == "test_shapes" for i in range(1000)]
+    assert 0.15 < np.mean(shares) < 0.25
+
+
+def test_a_second_run_does_nothing(source, result):
+    outcome, out = result
+    before = {p: p.stat().st_mtime_ns for p in out.rglob("*") if p.name != "convert.json"}
+    start = time.monotonic()
+    assert replace(convert([source], out, QUICK), seconds=0) == replace(outcome, seconds=0)
+    assert time.monotonic() - start < 5
+    assert {p: p.stat().st_mtime_ns for p in out.rglob("*") if p.name != "convert.json"} == before
+
+
+def test_only_what_changed_is_made_again(source, result, tmp_path):
+    _, converted = result
+    out, copy = tmp_path / "out", tmp_path / "source"
+    shutil.copytree(converted, out)
+    shutil.copytree(source, copy)
+    names = objects_in(out)
+    before = {n: (out / n / "object.npz").stat().st_mtime_ns for n in names}
+    mesh = next((copy / names[0] / "textured_objs").glob("*.obj"))
+    mesh.write_text(mesh.read_text() + "# changed\n")
+    convert([copy], out, QUICK, jobs=1)
+    changed = [n for n in names if (out / n / "object.npz").stat().st_mtime_ns != before[n]]
+    assert changed == names[:1]
+
+
+def test_an_object_that_became_broken_is_no_longer_there(result, source, tmp_path):
+    _, converted = result
+    out = tmp_path / "out"
+    shutil.copytree(converted, out)
+    names = objects_in(out)
+    for name in names[:2]:
+        shutil.copytree(source / name, tmp_path / name)
+    (tmp_path / names[0] / "mobility.urdf").unlink()
+    outcome = convert([tmp_path / names[0], tmp_path / names[1]], out, QUICK, jobs=1)
+    assert [f["id"] for f in outcome.failed] == [names[0]]
+    assert not (out / names[0]).exists()
+    assert set(SceneBank.load(out / "scenes.npz").object_id) <= {names[1]}
+
+
+def test_a_single_object_that_fails_raises_its_reason_and_leaves_nothing(source, result, tmp_path):
+    outcome, _ = result
+    with pytest.raises(ObjectError) as caught:
+        convert([source / outcome.failed[0]["id"]], tmp_path / "out", QUICK, jobs=1)
+    assert str(caught.value) == outcome.failed[0]["reason"]
+    assert not (tmp_path / "out").exists()
+    with pytest.raises(ObjectError, match="no such folder; name PartNet-Mobility object folders"):
+        convert([tmp_path / "nowhere"], tmp_path / "out", QUICK)
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(ObjectError, match=r"no mobility\.urdf in it"):
+        convert([tmp_path / "empty"], tmp_path / "out", QUICK, jobs=1)
+
+
+def _misbehave(folder: Path, how: str) -> None:
+    if how == "hang":
+        time.sleep(60)
+    if how == "die":
+        os._exit(3)
+    if how == "raise":
+        raise KeyError("x")
+    if how == "refuse":
+        raise ObjectError(f"{folder.name}: no")
+
+
+def test_processes_that_hang_die_or_raise_cost_only_their_own_task(tmp_path):
+    tasks = [(tmp_path / how, how) for how in ("hang", "die", "raise", "refuse", "work", "work2")]
+    start = time.monotonic()
+    errors = {task[1]: error for task, error in _pool(_misbehave, tasks, jobs=2, time_limit=15)}
+    assert time.monotonic() - start < 50
+    assert errors["hang"] == "hang: took longer than 15 s; raise --time-limit"
+    assert errors["die"] == "die: the process died (exit code 3)"
+    assert errors["raise"].startswith("raise: KeyError: 'x' (test_convert.py:")
+    assert errors["refuse"] == "refuse: no"
+    assert errors["work"] is None and errors["work2"] is None
+
+
+def test_merged_scenes_keep_their_parts_and_poses(result):
+    _, out = result
+    for name in objects_in(out):
+        converted = ConvertedObject.load(out / name)
+        bank = scene_bank([converted], 2, "hull", 0)
+        if not len(bank):
+            continue
+        tight, changed = within_budget(bank, converted, 12, 6, DecomposeConfig(), 0)
+        assert {(c.scene, c.side) for c in changed if c.side == "static"} == {
+            (s, "static") for s in np.flatnonzero(np.diff(bank.static_start) > 12)
+        }
+        assert np.diff(tight.static_start).max() <= 12 and np.diff(tight.part_start).max() <= 6
+        for f in fields(SceneBank):
+            if f.name in ("object_id", "part", "variant", "part_pos", "part_quat", "axis", "width", "urdf_closed"):
+                assert (getattr(tight, f.name) == getattr(bank, f.name)).all()
+        loose, unchanged = within_budget(bank, converted, 999, 999, DecomposeConfig(), 0)
+        assert not unchanged
+        assert (loose.instance_pos == bank.instance_pos).all()
+
+
+def test_banks_joined_are_their_scenes_one_after_the_other(result):
+    _, out = result
+    banks = [SceneBank.load(out / n / "scenes.npz") for n in objects_in(out)]
+    whole, first = joined(banks), 0
+    for bank in banks:
+        again = whole.select(np.arange(first, first + len(bank)))
+        alone = bank.select(np.arange(len(bank)))
+        for f in fields(SceneBank):
+            a, b = getattr(again, f.name), getattr(alone, f.name)
+            assert np.array_equal(a, b), f.name
+        first += len(bank)
+    assert first == len(whole)
+
+
+def test_the_page_names_every_object_and_refusal(result):
+    outcome, out = result
+    page = (out / "report.html").read_text()
+    for name in objects_in(out):
+        assert f'src="{name}/picture.png"' in page
+    assert f"<b>{outcome.failed[0]['id']}</b> refused" in page
+    assert (out / "contact_sheet.png").stat().st_size > 1000
+
+
+def test_hulls_leave_room_for_fingers_behind_real_handles(real_objects, tmp_path):
+    convert([real_objects / "45194"], tmp_path, replace(QUICK, views=0), jobs=1)
+    found = handles(ConvertedObject.load(tmp_path / "45194"))
+    assert len(found) == 4
+    assert all(h.visual and h.hulls for h in found)
