@@ -21,6 +21,7 @@ from flax import struct
 
 from vatmart_jax import geometry as g
 from vatmart_jax.bank import HINGE, SLIDE, SceneBank, Scenes, ViewBank
+from vatmart_jax.errors import UserError
 from vatmart_jax.physics import PhysicsConfig, PhysicsState, make_physics
 from vatmart_jax.physics.controller import hand_target, waypoint_controls
 from vatmart_jax.physics.template import FINGER_OPEN, FINGERS, HAND, PART, TIP
@@ -138,18 +139,20 @@ class Env:
     ):
         """Keeps the Scenes of the task's joint type and the views that leave room for the task.
 
-        Raises ValueError where nothing is left.
+        Raises UserError where nothing is left.
         """
         scenes = np.flatnonzero(bank.joint_type == task.joint_type)
         kind = "door (hinge)" if task.joint_type == HINGE else "drawer (slide)"
         if len(scenes) == 0:
-            raise ValueError(f"the data has no {kind}, which task {task.name} needs")
+            raise UserError(f"the data has no {kind}, which task {task.name} needs; give data with one or another --task")
         views = views.of_scenes(scenes)
         bank = bank.select(scenes)
         room = bank.width[views.scene] - views.q if task.opening else views.q
         views = views.select((views.opening == task.opening) & (room >= task.low))
         if len(views) == 0:
-            raise ValueError(f"the data has no view of a {kind} that can be moved by task {task.name}")
+            raise UserError(
+                f"the data has no view of a {kind} that can be moved by task {task.name}; convert with more --views"
+            )
         self.task, self.config = task, config or EnvConfig()
         self.bank, self.views = bank, views
         self.physics = make_physics(bank, impl, physics)
