@@ -27,6 +27,7 @@ from vatmart_jax.physics.controller import hand_target, waypoint_controls
 from vatmart_jax.physics.template import FINGER_OPEN, FINGERS, HAND, PART, TIP
 
 OBSERVATION, ACTION = 33, 6
+MIN_PUSHABLE = 4  # of a view's contacts; with fewer, it hardly shows where to push
 
 
 @dataclass(frozen=True)
@@ -74,7 +75,10 @@ class EnvConfig:
     grasp_min: float = 0.003
     """opening between closed fingers from which on something is held"""
     guided_share: float = 0.9
-    """share of contact points drawn from promising ones: faces that point against the motion (push), handles (pull)"""
+    """share of starts that are promising. Push: the contact's face points against the motion. Pull: a handle grasped
+    from the front across its thin side, or an edge of the part straddled along the motion"""
+    grasp_cone: float = float(np.radians(20))
+    """a promising grasp approaches within this angle of the straight one, and its roll is off by about half of it"""
     tolerance: float = 0.15
     """success: the part moved by the task within this share of it"""
 
@@ -137,18 +141,25 @@ class Env:
         config: EnvConfig | None = None,
         physics: PhysicsConfig | None = None,
     ):
-        """Keeps the Scenes of the task's joint type and the views that leave room for the task.
+        """Keeps the Scenes of the task's joint type, and the views that leave room for the task and show where to do
+        it: a door seen from the inside alone cannot be pushed shut. (The released code goes further: its trials are
+        ones that a policy has solved from that view.)
 
         Raises UserError where nothing is left.
         """
         scenes = np.flatnonzero(bank.joint_type == task.joint_type)
         kind = "door (hinge)" if task.joint_type == HINGE else "drawer (slide)"
         if len(scenes) == 0:
-            raise UserError(f"the data has no {kind}, which task {task.name} needs; give data with one or another --task")
+            raise UserError(
+                f"the data has no {kind}, which task {task.name} needs; give data with one or another --task"
+            )
         views = views.of_scenes(scenes)
         bank = bank.select(scenes)
         room = bank.width[views.scene] - views.q if task.opening else views.q
         views = views.select((views.opening == task.opening) & (room >= task.low))
+        promising = promising_contacts(bank, views, task)
+        shown = promising.sum(1) >= (1 if task.opening else MIN_PUSHABLE)
+        views, promising = views.select(shown), promising[shown]
         if len(views) == 0:
             raise UserError(
                 f"the data has no view of a {kind} that can be moved by task {task.name}; convert with more --views"
@@ -162,7 +173,8 @@ class Env:
         self._view_cdf = jnp.asarray(np.cumsum(_balanced(bank, views)), jnp.float32)
         self._contacts = jnp.asarray(views.contacts)
         self._normals = jnp.asarray(views.contact_normals)
-        self._promising = jnp.asarray(_promising(bank, views, task))
+        self._promising = jnp.asarray(promising)
+        self._grasps = tuple(map(jnp.asarray, grasps(bank, views))) if task.opening else None
 
     def sample(self, key: jax.Array, n: int) -> Start:
         """n random starts: category uniform, then object, Scene, view; task; contact; approach; roll.
@@ -170,16 +182,31 @@ class Env:
         Tasks follow the paper's order given the view: amount uniform first, then a start that leaves room for it.
         Consumes the key.
         """
-        kv, kt, kc, kg, ka, kr = jax.random.split(key, 6)
+        kv, kt, ka = jax.random.split(key, 3)
         view = jnp.searchsorted(self._view_cdf, jax.random.uniform(kv, (n,)) * self._view_cdf[-1])
         view = jnp.minimum(view, len(self.views) - 1).astype(jnp.int32)
-        task = self.sample_task(kt, view)
+        return self.approach(ka, view, self.sample_task(kt, view), self.config.guided_share)
+
+    def approach(self, key: jax.Array, view: jax.Array, task: jax.Array, guided_share: float) -> Start:
+        """Random contacts and hand orientations for views [B] and tasks [B]; a share of them promising ones.
+
+        The rest have any contact, an approach within the cone about the inward normal, any roll. Consumes the key.
+        """
+        kc, kg, ka, kr = jax.random.split(key, 4)
         # A guided start weighs promising contacts so much that others are drawn only where a view has none.
-        guided = jax.random.uniform(kg, (n, 1)) < self.config.guided_share
+        guided = jax.random.uniform(kg, (len(view), 1)) < guided_share
         contact = jax.random.categorical(kc, jnp.where(guided & self._promising[view], 20.0, 0.0), axis=-1)
         up = g.cone_direction(ka, -self._normals[view, contact], self.config.cone)
-        rotation = g.gripper_frame(up, jax.random.normal(kr, up.shape))
-        return Start(view, contact.astype(jnp.int32), task, rotation)
+        forward = jax.random.normal(kr, up.shape)
+        if self._grasps is not None:
+            straight, across = (x[view, contact] for x in self._grasps)
+            aligned = guided & self._promising[view, contact][:, None]
+            up = jnp.where(aligned, g.cone_direction(ka, straight, self.config.grasp_cone), up)
+            # The fingers close along the hand's y; either finger may be on either side.
+            side = jnp.where(forward[:, :1] > 0, 1.0, -1.0)
+            off = jnp.tan(0.5 * self.config.grasp_cone) * forward
+            forward = jnp.where(aligned, g.normalize(side * jnp.cross(across, up)) + off, forward)
+        return Start(view, contact.astype(jnp.int32), task, g.gripper_frame(up, forward))
 
     def sample_task(self, key: jax.Array, view: jax.Array) -> jax.Array:
         """[B] amounts for views [B]: density of t given q when t is uniform and q then uniform where t fits."""
@@ -207,15 +234,11 @@ class Env:
     def begin(self, start: Start) -> EnvState:
         """Put the hand at its start poses and, when pulling, grasp."""
         config, pulling = self.config, self.task.opening
-        scene = self._view_scene[start.view]
-        q0 = self._view_q[start.view]
-        point = self._contacts[start.view, start.contact]
+        physics = self._placed(start)
+        scene, n = physics.scene, len(start.view)
+        q0, point = self._view_q[start.view], self._contacts[start.view, start.contact]
         up = start.rotation[:, :, 2]
-        hand = point - (TIP + config.standoff) * up
-        n = len(scene)
         fingers = jnp.full((n,), FINGER_OPEN if pulling else 0.0)
-        qpos = jnp.concatenate([q0[:, None], jnp.zeros((n, 6)), fingers[:, None], fingers[:, None]], -1)
-        physics = self.physics.reset(scene, jnp.concatenate([hand, g.quat_from_matrix(start.rotation)], -1), qpos)
         in_collision = physics.in_contact | physics.diverged
         zero = jnp.zeros((n, 3))
         ctrl = hand_target(zero, zero, start.rotation, fingers)
@@ -255,6 +278,11 @@ class Env:
         obs, distance = self._observe(state)
         return state.replace(obs=obs, info={**state.info, "tip_distance": distance})
 
+    def is_free(self, start: Start) -> jax.Array:
+        """[B] bool, the start poses touch nothing."""
+        physics = self._placed(start)
+        return ~(physics.in_contact | physics.diverged)
+
     def step(self, state: EnvState, action: jax.Array, abandon: bool = True) -> EnvState:
         """One waypoint from an action [B, 6] in [-1, 1]: move of the fingertips and turn (rotation vector) of the
         hand, both in the joint-local frame. Trials that are done stay as they are; one is done when it succeeds,
@@ -284,6 +312,16 @@ class Env:
             return self._advance(state, residual), None
 
         return jax.lax.scan(waypoint, self.begin(start), residuals.swapaxes(0, 1))[0]
+
+    def _placed(self, start: Start) -> PhysicsState:
+        """The hand at its start poses, closed to push and open to pull."""
+        scene, q0 = self._view_scene[start.view], self._view_q[start.view]
+        point = self._contacts[start.view, start.contact]
+        hand = point - (TIP + self.config.standoff) * start.rotation[:, :, 2]
+        n = len(scene)
+        fingers = jnp.full((n, 2), FINGER_OPEN if self.task.opening else 0.0)
+        qpos = jnp.concatenate([q0[:, None], jnp.zeros((n, 6)), fingers], -1)
+        return self.physics.reset(scene, jnp.concatenate([hand, g.quat_from_matrix(start.rotation)], -1), qpos)
 
     def _advance(self, state: EnvState, residual: jax.Array) -> EnvState:
         active = ~state.done
@@ -350,27 +388,31 @@ class Env:
             z = g.normalize(side - jnp.sum(side * x, -1, keepdims=True) * x)
         return jnp.stack([x, jnp.cross(z, x), z], -1)
 
-    def _contact_now(self, state: EnvState) -> jax.Array:
-        """[B, 3] where the contact point, which moves with the part, is now; object frame."""
+    def carried(self, state: EnvState, point: jax.Array, amount: jax.Array) -> jax.Array:
+        """[B, 3] where points [B, 3] of the part come to when it moves by `amount` [B] in the task's sense."""
         scene = state.physics.scene
-        axis, change = self._scenes.axis[scene], (state.physics.qpos[:, PART] - state.q0)[:, None]
+        axis, change = self._motion_axis(scene), amount[:, None]
         if self.task.joint_type == HINGE:
             anchor = self._scenes.anchor[scene]
-            return anchor + g.rotate(g.matrix_from_rotvec(axis * change), state.point - anchor)
-        return state.point + axis * change
+            return anchor + g.rotate(g.matrix_from_rotvec(axis * change), point - anchor)
+        return point + axis * change
+
+    def tip(self, state: EnvState) -> jax.Array:
+        """[B, 3] the point between the fingertips, object frame."""
+        hand_q, start = state.physics.qpos[:, HAND], state.start.rotation
+        now = start @ g.matrix_from_euler(hand_q[:, 3:])
+        return state.physics.gripper_pose[:, :3] + g.rotate(start, hand_q[:, :3]) + TIP * now[:, :, 2]
 
     def _observe(self, state: EnvState) -> tuple[jax.Array, jax.Array]:
         """The paper's 33 numbers in the joint-local frame [B, 33], and the fingertips' distance to the contact [B]."""
         frame, start, physics = state.frame, state.start.rotation, state.physics
         local = lambda v: g.unrotate(frame, v)  # noqa: E731
         task, moved = state.start.task, state.moved
-        hand_q = physics.qpos[:, HAND]
-        hand = physics.gripper_pose[:, :3] + g.rotate(start, hand_q[:, :3])
-        now = start @ g.matrix_from_euler(hand_q[:, 3:])
-        tip = hand + TIP * now[:, :, 2]
+        now = start @ g.matrix_from_euler(physics.qpos[:, HAND][:, 3:])
+        tip = self.tip(state)
         start_in_frame = jnp.einsum("bji,bjk->bik", frame, start)
         turn = g.rotvec_from_matrix(jnp.einsum("bji,bjk,blk,blm->bim", frame, now, start, frame))
-        contact = self._contact_now(state)
+        contact = self.carried(state, state.point, moved)
         anchor, axis = self._scenes.anchor[physics.scene], self._motion_axis(physics.scene)
         from_anchor = contact - anchor
         nearest = anchor + jnp.sum(from_anchor * axis, -1, keepdims=True) * axis
@@ -407,17 +449,94 @@ def reward_terms(task, before, after, distance, success) -> dict[str, jax.Array]
     }
 
 
-def _promising(bank: SceneBank, views: ViewBank, task: Task) -> np.ndarray:
-    """[V, C] bool: contacts on handles (pull), or on faces against the part's motion and off its axis (push)."""
-    if task.opening:
-        return views.contact_handle
+def promising_contacts(bank: SceneBank, views: ViewBank, task: Task) -> np.ndarray:
+    """[V, C] bool: where the task may be done.
+
+    Push: faces that look against the part's motion, off its axis. Pull: the handle, where the view shows one; else
+    faces along the motion and off the axis, which two fingers may straddle.
+    """
+    motion, arm = _motion(bank, views)
+    along = (views.contact_normals * motion).sum(-1)
+    if not task.opening:
+        return (along > 0.5) & (arm > 0.1)
+    shown = views.contact_handle.any(1, keepdims=True)
+    return np.where(shown, views.contact_handle, (np.abs(along) < 0.4) & (arm > 0.1))
+
+
+def _motion(bank: SceneBank, views: ViewBank) -> tuple[np.ndarray, np.ndarray]:
+    """Unit directions [V, C, 3] in which contacts move as the part opens, and their distance to the axis [V, C]
+    (slides: 1)."""
     scenes = Scenes.of(bank)
-    axis = -np.asarray(scenes.axis)[views.scene][:, None]
-    if task.joint_type == SLIDE:
-        return (views.contact_normals * axis).sum(-1) < -0.5
+    axis = np.broadcast_to(np.asarray(scenes.axis)[views.scene][:, None], views.contacts.shape)
+    if bank.joint_type[0] == SLIDE:
+        return axis, np.ones(axis.shape[:2])
     motion = np.cross(axis, views.contacts - np.asarray(scenes.anchor)[views.scene][:, None])
-    speed = np.linalg.norm(motion, axis=-1)
-    return ((views.contact_normals * motion).sum(-1) < -0.5 * speed) & (speed > 0.1)
+    arm = np.linalg.norm(motion, axis=-1)
+    return motion / np.maximum(arm, 1e-6)[..., None], arm
+
+
+def grasps(bank: SceneBank, views: ViewBank) -> tuple[np.ndarray, np.ndarray]:
+    """The straight grasp at every contact: approach direction [V, C, 3] and the axis along which the fingers close
+    [V, C, 3], float32 unit, object frame.
+
+    A handle is approached against the opening motion, the fingers closing across the thin side of the handle's shape
+    next to the contact. Elsewhere the hand comes along the inward normal and the fingers close along the motion.
+    """
+    motion, _ = _motion(bank, views)
+    up = np.where(views.contact_handle[..., None], -motion, -views.contact_normals)
+    across = motion.copy()
+    shapes = {s: _handle_shapes(bank, s) for s in np.unique(views.scene).tolist()}
+    for view in np.flatnonzero(views.contact_handle.any(1)):
+        scene = int(views.scene[view])
+        rows = np.flatnonzero(views.contact_handle[view])
+        # Contacts and directions in the part's frame, where its shapes are.
+        rotation, position = _part_pose(bank, scene, float(views.q[view]))
+        contact = (views.contacts[view, rows] - position) @ rotation
+        if shapes[scene]:
+            local = _thin_axes(shapes[scene], contact, up[view, rows] @ rotation)
+            across[view, rows] = local @ rotation.T
+    across -= (across * up).sum(-1, keepdims=True) * up
+    across /= np.maximum(np.linalg.norm(across, axis=-1, keepdims=True), 1e-6)
+    return up.astype(np.float32), across.astype(np.float32)
+
+
+def _handle_shapes(bank: SceneBank, scene: int) -> list[np.ndarray]:
+    """Vertices [n, 3] of the moving part's handle shapes, part frame."""
+    rows = np.arange(bank.part_start[scene], bank.part_start[scene + 1])
+    found = []
+    for row in rows[bank.instance_handle[rows]]:
+        shape = int(bank.instance_shape[row])
+        corners = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
+        vertices = bank.hull(shape) if bank.collision == "hull" else corners * bank.box_size[shape]
+        rotation = np.asarray(g.matrix_from_quat(jnp.asarray(bank.instance_quat[row], jnp.float32)))
+        found.append(vertices @ rotation.T + bank.instance_pos[row])
+    return found
+
+
+def _part_pose(bank: SceneBank, scene: int, q: float) -> tuple[np.ndarray, np.ndarray]:
+    """Rotation [3, 3] and position [3] of the part's frame at opening q, object frame."""
+    rotation = np.asarray(g.matrix_from_quat(jnp.asarray(bank.part_quat[scene], jnp.float32)))
+    axis, position = bank.axis[scene], bank.part_pos[scene]
+    if bank.joint_type[scene] == HINGE:
+        return rotation @ np.asarray(g.matrix_from_rotvec(jnp.asarray(axis * q, jnp.float32))), position
+    return rotation, position + rotation @ axis * q
+
+
+def _thin_axes(shapes: list[np.ndarray], contacts: np.ndarray, up: np.ndarray) -> np.ndarray:
+    """[n, 3] for contacts [n, 3]: the direction across `up` [n, 3] in which the nearest shape is thinnest."""
+    distance = [np.linalg.norm(contacts - np.clip(contacts, v.min(0), v.max(0)), axis=-1) for v in shapes]
+    nearest = np.argmin(distance, axis=0)
+    side = np.where(np.abs(up[:, 2:]) < 0.9, [[0.0, 0.0, 1.0]], [[0.0, 1.0, 0.0]])
+    x = np.cross(side, up)
+    x /= np.linalg.norm(x, axis=-1, keepdims=True)
+    angle = np.linspace(0, np.pi, 24, endpoint=False)[:, None, None]
+    directions = np.cos(angle) * x + np.sin(angle) * np.cross(up, x)  # [24, n, 3]
+    out = np.zeros_like(contacts)
+    for shape in np.unique(nearest):
+        rows = np.flatnonzero(nearest == shape)
+        extent = np.ptp(directions[:, rows] @ shapes[shape].T, axis=-1)
+        out[rows] = directions[extent.argmin(0), rows]
+    return out
 
 
 def _balanced(bank: SceneBank, views: ViewBank) -> np.ndarray:

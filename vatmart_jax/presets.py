@@ -24,6 +24,9 @@ class Schedule:
     collect: int = 32
     """batches of trials by the finished policy from random starts, failures included"""
     collect_noise: float = 0.05
+    """of the actions then, share of their range"""
+    collect_expert: float = 0.25
+    """share of these trials that the scripted expert makes, with the same noise"""
     scorer: int = 600
     proposal: int = 600
     actionability: int = 150

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +17,7 @@ from vatmart_jax.env import TASKS, Env
 from vatmart_jax.errors import UserError
 from vatmart_jax.evaluation.downstream import Method, downstream, random_method
 from vatmart_jax.evaluation.priors import labelled, priors_metrics
+from vatmart_jax.expert import run_expert
 from vatmart_jax.inference import Priors
 from vatmart_jax.perception.train import clouds_of
 from vatmart_jax.pipeline.collect import ProposalTrials
@@ -23,7 +25,7 @@ from vatmart_jax.pipeline.explore import Explorer
 from vatmart_jax.pipeline.run import read_config, write_json, write_text
 from vatmart_jax.presets import Settings
 
-METHODS = ("ours", "random")
+METHODS = ("ours", "random", "expert")
 METRICS = ("priors", "downstream")
 _LABELLED = 350  # positives, and as many negatives (paper, section 5.1)
 
@@ -107,6 +109,8 @@ def evaluate_split(
             clouds = clouds_of(env.views, priors.config.networks.pointnet)
             trial = ProposalTrials(env, clouds, priors.networks, proposals)
             method = _ours(trial, priors)
+        elif name == "expert":
+            method = partial(run_expert, env)
         else:
             method = random_method(env)
         label = f"evaluate {name} on {split}"

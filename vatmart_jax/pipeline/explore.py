@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -10,6 +11,7 @@ from flax import struct
 
 from vatmart_jax import geometry as g
 from vatmart_jax.env import ACTION, OBSERVATION, Env, EnvState, Start, reward_terms
+from vatmart_jax.expert import expert_action
 from vatmart_jax.rl.replay import Episode, Replay, hindsight
 from vatmart_jax.rl.td3 import TD3, TD3Config, TD3State
 
@@ -28,7 +30,7 @@ class ExploreConfig:
     random: float = 0.1
     """share of uniformly random actions, decaying as the noise does"""
     warmup: int = 4
-    """iterations of random actions only"""
+    """iterations before the policy acts: half of the trials take random actions, half are the scripted expert's"""
     hindsight_low: float = 0.5
     """relabelled tasks reach down to this share of the smallest task"""
 
@@ -60,11 +62,13 @@ class Explorer:
         return ExploreState(self.td3.init(kt), replay, ks, jnp.zeros((), jnp.int32))
 
     def _run(
-        self, policy, pool: Start | None, key: jax.Array, noise, random, abandon: bool = True
+        self, policy, pool: Start | None, key: jax.Array, noise, random, expert: Any = 0.0, abandon: bool = True
     ) -> tuple[EnvState, Episode]:
         """One batch of trials; from the pool if there is one, else from random starts. Consumes the key.
 
-        Without `abandon` the policy acts out trials that cannot succeed too: perception learns from them.
+        noise: share of the action range; random: share of uniform actions; expert: share of trials that the scripted
+        expert makes, with the same noise. Without `abandon` trials that cannot succeed are acted out too: perception
+        learns from them.
         """
         kr, ke = jax.random.split(key)
         begun = self.env.reset(kr, pool)
@@ -73,6 +77,9 @@ class Explorer:
 
         def step(state: EnvState, key: jax.Array):
             action = self.td3.explore(policy, state.obs, key, noise, random)
+            shown = expert_action(self.env, state)
+            shown = jnp.clip(shown + noise * jax.random.normal(key, shown.shape), -1, 1)
+            action = jnp.where(jnp.arange(len(action))[:, None] < expert * len(action), shown, action)
             after = self.env.step(state, action, abandon)
             record = Episode(
                 state.obs, action, after.reward, after.obs, after.done, ~state.done,
@@ -93,8 +100,10 @@ class Explorer:
         progress = jnp.minimum(state.iteration / max(1, config.iterations - 1), 1.0)
         first, last = config.noise
         decay = (last / first) ** progress
-        random = jnp.where(state.iteration < config.warmup, 1.0, config.random * decay)
-        final, episode = self._run(state.td3.policy, pool, kr, first * decay, random)
+        warm = state.iteration < config.warmup
+        random = jnp.where(warm, 1.0, config.random * decay)
+        expert = jnp.where(warm, 0.5, 0.0)
+        final, episode = self._run(state.td3.policy, pool, kr, first * decay, random, expert)
         penalty = jnp.zeros_like(final.reward) if curiosity is None else curiosity(final)
         ended = episode.active & episode.done & final.success
         episode = episode.replace(reward=episode.reward - penalty * ended)

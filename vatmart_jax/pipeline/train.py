@@ -127,8 +127,9 @@ class Training:
         schedule = self._settings.schedule
         for done in range(int(progress.done), schedule.collect):
             final, _ = self._explorer.run(
-                progress.explore.td3.policy, None, self.key("collect", done), schedule.collect_noise, 0.0, abandon=False
-            )
+                progress.explore.td3.policy, None, self.key("collect", done), schedule.collect_noise, 0.0,
+                schedule.collect_expert, abandon=False,
+            )  # fmt: skip
             samples = samples_of(final)
             metrics = {
                 "success": samples.success(self._env.config.tolerance).mean(),
