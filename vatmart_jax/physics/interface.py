@@ -8,9 +8,10 @@ import jax
 from flax import struct
 
 from vatmart_jax.bank import SceneBank
+from vatmart_jax.errors import UserError
 from vatmart_jax.physics.template import PhysicsConfig
 
-IMPLS = ("c",)
+IMPLS = ("c", "warp", "jax")
 
 
 @struct.dataclass
@@ -49,4 +50,15 @@ def make_physics(bank: SceneBank, impl: str = "c", config: PhysicsConfig | None 
         from vatmart_jax.physics.c import CPhysics
 
         return CPhysics(bank, config or PhysicsConfig())
+    if impl == "jax":
+        from vatmart_jax.physics.mjx import MjxPhysics
+
+        return MjxPhysics(bank, config or PhysicsConfig())
+    if impl == "warp":
+        try:
+            from vatmart_jax.physics.warp import WarpPhysics
+        except ImportError as e:
+            raise UserError(f"impl warp needs MuJoCo Warp ({e}); install it: pip install 'vatmart-jax[warp]'") from e
+
+        return WarpPhysics(bank, config or PhysicsConfig())
     raise ValueError(f"impl {impl!r} is not one of {', '.join(IMPLS)}")

@@ -1,0 +1,204 @@
+"""Physics on any XLA device: MJX, vmapped over simulations of different Scenes."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+from mujoco import mjx
+from mujoco.mjx._src import mesh  # nothing public makes a ConvexMesh; mujoco-mjx is pinned to one minor version
+
+from vatmart_jax import geometry as g
+from vatmart_jax.bank import SceneBank
+from vatmart_jax.physics.interface import PhysicsState
+from vatmart_jax.physics.template import PhysicsConfig, Template, scene_model, template
+
+# MJX tests every pair of geoms that it is given, near or not. So each of the gripper's three boxes gets its own nearest
+# slots, chosen anew every few steps: this many of the static object and of the part.
+BOXES = ("hand", "left_finger", "right_finger")
+NEAR = (2, 3)
+RENEW = 4
+# Its Newton solver runs for the slowest of the batch, and its line search always to the end.
+ITERATIONS, LS_ITERATIONS = 5, 5
+# Twisting is resisted by manifolds of up to four points: two rows per contact are saved.
+CONDIM = 3
+
+
+class Slots(NamedTuple):
+    """What fills N slots of a body, and oriented boxes around it; body frame."""
+
+    pos: jax.Array  # [..., N, 3] of the geom
+    quat: jax.Array  # [..., N, 4]
+    size: jax.Array  # [..., N, 3]
+    mesh: jax.Array  # [..., N] int32, -1 in a box bank
+    centre: jax.Array  # [..., N, 3] of the oriented box
+    half: jax.Array  # [..., N, 3]
+
+
+class SceneRow(NamedTuple):
+    """A Scene as leaves of an mjx.Model."""
+
+    fields: dict[str, jax.Array]  # of bodies, joints and degrees of freedom
+    static: Slots
+    part: Slots
+
+
+class MjxPhysics:
+    """The trials of CPhysics in float32, with the contacts that MJX finds. `vmap` adds simulations to the batch."""
+
+    def __init__(self, bank: SceneBank, config: PhysicsConfig):
+        self.config = config
+        full = template(bank, config)
+        static, part = (np.flatnonzero(full.model.geom_bodyid == full.model.body(b).id) for b in ("object", "part"))
+        self._near = [min(n, len(slots)) for n, slots in zip(NEAR, (static, part), strict=True)]
+        counts = [len(BOXES) * n for n in self._near]
+        model = scene_model(bank, 0, config, (counts[0], counts[1]))
+        model.opt.iterations, model.opt.ls_iterations = ITERATIONS, LS_ITERATIONS
+        boxes = [model.geom(name).id for name in BOXES]
+        near, own = sum(counts), np.concatenate([np.repeat(np.arange(len(BOXES)), n) for n in self._near])
+        model.geom_condim[:] = CONDIM
+        model.geom_contype[:near], model.geom_conaffinity[:near] = 0, 1 << own
+        model.geom_contype[boxes], model.geom_conaffinity[boxes] = 1 << np.arange(len(BOXES)), 0
+        self._meshes = _convex_meshes(full.model) if bank.collision == "hull" else None
+        if self._meshes is not None:
+            model.geom_dataid[:near] = model.mesh("parked").id
+        self._model = mjx.put_model(model, impl="jax")
+        if self._meshes is not None:
+            # Every mesh id is a kernel of its own, whose shape is a leaf: one for each slot.
+            self._model = self._model.replace(geom_dataid=np.concatenate([np.arange(near), model.geom_dataid[near:]]))
+        self._data = mjx.make_data(self._model)
+        self._boxes, self._part, self._base = np.array(boxes), model.body("part").id, model.body("gripper_base").id
+        fields = {
+            name: jnp.asarray(value, jnp.float32)
+            for name, value in full.fields.items()
+            if not name.startswith("geom_") and isinstance(getattr(self._model, name), jax.Array)
+        }
+        self._scenes = SceneRow(fields, _slots(full, static), _slots(full, part))
+
+    def reset(self, scene: jax.Array, gripper_pose: jax.Array, qpos: jax.Array) -> PhysicsState:
+        def contact(row, pose, qpos):
+            data = self._data.replace(qpos=qpos)
+            model = self._with_slots(self._placed(row, pose), self._nearest(row, pose, qpos))
+            return _touches(mjx.collision(model, mjx.kinematics(model, data)))
+
+        scene, gripper_pose, qpos = jnp.asarray(scene), jnp.asarray(gripper_pose), jnp.asarray(qpos)
+        sound = jnp.isfinite(qpos).all(-1) & jnp.isfinite(gripper_pose).all(-1)
+        touches = jax.vmap(contact)(self._rows(scene), gripper_pose, qpos)
+        zero = jnp.zeros_like(qpos)
+        return PhysicsState(scene, gripper_pose, qpos, zero, touches & sound, ~sound, _bits(zero))
+
+    def rollout(self, state: PhysicsState, ctrl: jax.Array, active: jax.Array) -> PhysicsState:
+        rows, pose = self._rows(state.scene), state.gripper_pose
+        nearest = jax.vmap(self._nearest)
+
+        def step(carry, at):
+            i, ctrl = at
+            near, qpos, qvel, warmstart, _, sound = carry
+            near = jax.lax.cond(i % RENEW == 0, lambda: nearest(rows, pose, qpos), lambda: near)
+            after = jax.vmap(self._step)(rows, pose, near, qpos, qvel, warmstart, ctrl)
+            # NaN compares as false.
+            sound &= (jnp.abs(jnp.concatenate(after[:3], -1)) < mujoco.mjMAXVAL).all(-1)
+            return (near, *after, sound), None
+
+        sound = jnp.isfinite(ctrl).all((-1, -2))
+        warmstart = jax.lax.bitcast_convert_type(state.exact, jnp.float32)
+        # Filled in by the first step; a call here would be compiled once more.
+        near = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), jax.eval_shape(nearest, rows, pose, state.qpos))
+        begin = (near, state.qpos, state.qvel, warmstart, state.in_contact, sound)
+        steps = jnp.arange(ctrl.shape[1]), jnp.asarray(ctrl).swapaxes(0, 1)
+        (_, qpos, qvel, warmstart, touches, sound), _ = jax.lax.scan(step, begin, steps)
+        runs = active & ~state.diverged
+        kept = lambda new, old: jnp.where((runs & sound)[:, None], new, old)  # noqa: E731
+        return state.replace(
+            qpos=kept(qpos, state.qpos),
+            qvel=kept(qvel, state.qvel),
+            in_contact=jnp.where(runs & sound, touches, state.in_contact),
+            diverged=state.diverged | (runs & ~sound),
+            exact=kept(_bits(warmstart), state.exact),
+        )
+
+    def _rows(self, scene: jax.Array) -> SceneRow:
+        return jax.tree.map(lambda table: table[scene], self._scenes)
+
+    def _step(self, row: SceneRow, pose, near: Slots, qpos, qvel, warmstart, ctrl):
+        """One step of one simulation: its new qpos, qvel, qacc_warmstart, and whether it is in contact."""
+        data = self._data.replace(qpos=qpos, qvel=qvel, qacc_warmstart=warmstart, ctrl=ctrl)
+        data = mjx.step(self._with_slots(self._placed(row, pose), near), data)
+        return data.qpos, data.qvel, data.qacc_warmstart, _touches(data)
+
+    def _placed(self, row: SceneRow, pose: jax.Array) -> mjx.Model:
+        """The model of one simulation: its Scene, but for the geoms, and its gripper's start pose."""
+        model = self._model.replace(**row.fields)
+        # In MJX the children of a mocap body do not follow mocap_pos (mujoco-mjx 3.17), but they do follow body_pos.
+        return model.replace(
+            body_pos=model.body_pos.at[self._base].set(pose[:3]),
+            body_quat=model.body_quat.at[self._base].set(pose[3:]),
+        )
+
+    def _nearest(self, row: SceneRow, pose: jax.Array, qpos: jax.Array) -> Slots:
+        """The slots nearest to each of the gripper's boxes: the static ones, then the part's."""
+        model = self._placed(row, pose)
+        at = mjx.kinematics(model, self._data.replace(qpos=qpos))
+        boxes = at.geom_xpos[self._boxes], at.geom_xmat[self._boxes], model.geom_size[self._boxes]
+        static = _nearest(row.static, jnp.zeros(3), jnp.eye(3), *boxes, self._near[0])
+        part = _nearest(row.part, at.xpos[self._part], at.xmat[self._part], *boxes, self._near[1])
+        return jax.tree.map(lambda *x: jnp.concatenate(x), static, part)
+
+    def _with_slots(self, model: mjx.Model, near: Slots) -> mjx.Model:
+        n = len(near.pos)
+        model = model.replace(
+            geom_pos=model.geom_pos.at[:n].set(near.pos),
+            geom_quat=model.geom_quat.at[:n].set(near.quat),
+            geom_size=model.geom_size.at[:n].set(near.size),
+        )
+        if self._meshes is None:
+            return model
+        shapes = jax.tree.map(lambda x: x[near.mesh], self._meshes)
+        convex = tuple(jax.tree.map(lambda x, i=i: x[i], shapes) for i in range(n))
+        return model.replace(_impl=model._impl.replace(mesh_convex=convex))
+
+
+def _slots(full: Template, geoms: np.ndarray) -> Slots:
+    fields = {name: value[:, geoms] for name, value in full.fields.items() if name.startswith("geom_")}
+    box = fields["geom_dataid"] < 0
+    centre, half = np.split(fields["geom_aabb"].reshape(*box.shape, 6), 2, -1)
+    mat = np.asarray(g.matrix_from_quat(jnp.asarray(fields["geom_quat"])))
+    centre = fields["geom_pos"] + np.einsum("snij,snj->sni", mat, centre)
+    arrays = (fields["geom_pos"], fields["geom_quat"], fields["geom_size"], fields["geom_dataid"], centre, half)
+    return Slots(*(jnp.asarray(a, jnp.int32 if a.dtype.kind == "i" else jnp.float32) for a in arrays))
+
+
+def _nearest(slots: Slots, pos, mat, box_pos, box_mat, box_half, n: int) -> Slots:
+    """For each of K boxes the n nearest slots of a body, [K * n], by the widest gap along the six axes of both."""
+    apart = box_pos - (pos + slots.centre @ mat.T)[:, None]  # [N, K, 3]
+    mats = mat @ g.matrix_from_quat(slots.quat)
+    turn = jnp.abs(jnp.einsum("nji,kjl->nkil", mats, box_mat))
+    along = jnp.abs(jnp.einsum("nji,nkj->nki", mats, apart)) - slots.half[:, None]
+    along -= jnp.einsum("nkil,kl->nki", turn, box_half)
+    across = jnp.abs(jnp.einsum("kji,nkj->nki", box_mat, apart)) - box_half
+    across -= jnp.einsum("nkil,ni->nkl", turn, slots.half)
+    gap = jnp.maximum(along.max(-1), across.max(-1))
+    chosen = jax.lax.top_k(-gap.T, n)[1].ravel()
+    return jax.tree.map(lambda x: x[chosen], slots)
+
+
+def _convex_meshes(model: mujoco.MjModel) -> mjx._src.types.ConvexMesh:
+    """Every mesh of the model, padded to one size by repetition, which changes no contact; leaves [M, ...]."""
+    meshes = [jax.tree.map(np.asarray, mesh.convex(model, i)) for i in range(model.nmesh)]
+
+    def stacked(*arrays):
+        size = np.max([a.shape for a in arrays], axis=0)
+        return jnp.stack([np.pad(a, [(0, n - m) for n, m in zip(size, a.shape, strict=True)], "edge") for a in arrays])
+
+    return jax.tree.map(stacked, *meshes)
+
+
+def _touches(data: mjx.Data) -> jax.Array:
+    return (data._impl.contact.dist < 0).any()
+
+
+def _bits(x: jax.Array) -> jax.Array:
+    return jax.lax.bitcast_convert_type(x, jnp.uint32)
