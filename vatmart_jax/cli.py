@@ -6,6 +6,7 @@ import os
 import sys
 import time
 from collections.abc import Callable
+from ctypes.util import find_library
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Annotated, Any
@@ -14,7 +15,7 @@ import tyro
 from tyro.conf import Positional, arg
 
 from vatmart_jax import __version__
-from vatmart_jax.errors import UserError
+from vatmart_jax.errors import OpenGLError, UserError
 
 _Json = Annotated[bool, arg(help="print one JSON object as the last line of standard output")]
 
@@ -158,7 +159,7 @@ def _evaluate(argv: list[str]) -> None:
         metrics: str = "priors,downstream"
         """priors, downstream, or both"""
         methods: str = "ours,random"
-        """of downstream: ours, random"""
+        """of downstream: ours, random, expert (a script that knows the joint: the ceiling)"""
         trials: int = 350
         """per method and split"""
         seed: int = 1
@@ -188,11 +189,159 @@ def _evaluate(argv: list[str]) -> None:
     _print_result(result, args.json, table)
 
 
+def _play(argv: list[str]) -> None:
+    """Show one trial as an animated picture, or in MuJoCo's viewer."""
+
+    @dataclass(frozen=True)
+    class Play:
+        """Show one trial: the scripted expert's, what a run's priors propose, or a trajectory from a file."""
+
+        scene: Positional[str]
+        """object id, id:part, or index into the data's Scenes"""
+        data: Path | None = None
+        """a folder of objects, or what `vatmart convert` made of it; default the run's data, or the bundled objects"""
+        task: str | None = None
+        """default the run's, or to push"""
+        amount: float | None = None
+        """how far to move the part, rad or unit lengths; default random"""
+        run: Path | None = None
+        """a run folder of `vatmart train`: the best proposal of its priors"""
+        trajectory: Path | None = None
+        """a .npy file of 30 numbers: 6D rotation of the start pose, then four residual waypoints"""
+        contact: tuple[float, float, float] | None = None
+        """with --trajectory: touch the part nearest to this point; default a random one"""
+        out: Path = Path("play.gif")
+        viewer: bool = False
+        """MuJoCo's viewer instead of a picture"""
+        seed: int = 0
+        json: _Json = False
+
+    args = tyro.cli(Play, args=argv, prog="vatmart play")
+    if args.run and args.trajectory:
+        raise UserError("--run and --trajectory: give one of them")
+    if sys.platform == "linux" and not args.viewer:
+        # MuJoCo reads it when it is imported.
+        os.environ.setdefault("MUJOCO_GL", "egl" if find_library("EGL") else "osmesa")
+    try:
+        import mujoco  # noqa: F401
+    except (ImportError, AttributeError) as e:  # what PyOpenGL raises where the library is missing
+        raise OpenGLError from e
+    _enable_compilation_cache()
+    from vatmart_jax.pipeline.run import read_config
+    from vatmart_jax.play import animate, play, show
+    from vatmart_jax.progress import Bars
+
+    of_run = read_config(args.run)["data"] if args.run else None
+    with Bars() as bars:
+        folder = _prepared(args.data or (Path(of_run) if of_run else None), bars.say)
+    recording, result = play(
+        folder, args.scene, args.task, args.amount, args.trajectory, args.contact, args.run, args.seed
+    )
+    if args.viewer:
+        show(recording)
+    else:
+        animate(recording, args.out)
+        result["file"] = str(args.out)
+    _print_result(result, args.json)
+
+
+def _bench(argv: list[str]) -> None:
+    """Measure speed and agreement: bench physics, parity or perception."""
+    what = argv[0] if argv else ""
+    if what not in _BENCHES:
+        raise UserError(f"bench {what}: say what to measure, one of {', '.join(_BENCHES)}")
+    args = tyro.cli(_BENCHES[what], args=argv[1:], prog=f"vatmart bench {what}")
+    _enable_compilation_cache()
+    from vatmart_jax.bench import Choice
+    from vatmart_jax.progress import Bars
+
+    if len(args.data) > (2 if what == "parity" else 1):
+        raise UserError(f"--data: {len(args.data)} folders; give one (parity: or two conversions of the same objects)")
+    with Bars() as bars:
+        folders = [_prepared(data, bars.say) for data in args.data or (None,)]
+        result = args.run(Choice(folders[0], args.split, args.objects), folders[1:], bars.say)
+    if args.out:
+        args.out.write_text(json.dumps(result, indent=1) + "\n")
+    _print_result(result, args.json)
+
+
+@dataclass(frozen=True)
+class _Bench:
+    data: tuple[Path, ...] = ()
+    """a folder of objects, or what `vatmart convert` made of it; default the bundled objects"""
+    split: str = "train"
+    """train, test_shapes, test_categories, extra or all"""
+    objects: int | None = None
+    """only so many of its objects, drawn at random"""
+    seed: int = 0
+    out: Path | None = None
+    """also write the result to this .json file"""
+    json: _Json = False
+
+
+@dataclass(frozen=True)
+class _BenchPhysics(_Bench):
+    """Physics steps and whole trials per second."""
+
+    impl: str = "c"
+    """c, warp or jax"""
+    batch: str = "1024"
+    """simulations at once; several as in 256,1024,4096"""
+    task: str = "push-door"
+    seconds: float = 10.0
+    """each measurement lasts at least so long"""
+
+    def run(self, choice: Any, others: list[Path], say: Callable[[str], None]) -> dict[str, Any]:
+        from vatmart_jax.bench import bench_physics
+
+        try:
+            batches = tuple(int(word) for word in self.batch.split(","))
+        except ValueError as e:
+            raise UserError(f"--batch {self.batch}: expected whole numbers, as in 256,1024,4096") from e
+        return bench_physics(choice, self.impl, batches, self.task, self.seed, self.seconds)
+
+
+@dataclass(frozen=True)
+class _BenchParity(_Bench):
+    """The same random trials on several implementations; with a second --data folder (boxes) also on that."""
+
+    impls: str = "c,warp,jax"
+    """the first is the reference"""
+    trials: int = 120
+    """per task"""
+
+    def run(self, choice: Any, others: list[Path], say: Callable[[str], None]) -> dict[str, Any]:
+        from vatmart_jax.bench import bench_parity
+
+        twin = others[0] if others else None
+        return bench_parity(choice, tuple(self.impls.split(",")), self.trials, self.seed, twin, say)
+
+
+@dataclass(frozen=True)
+class _BenchPerception(_Bench):
+    """Training steps per second, and how long a view of 10,000 points takes to encode."""
+
+    preset: str = "cpu"
+    """whose networks: quick, cpu, gpu or paper"""
+    seconds: float = 10.0
+    """each measurement lasts at least so long"""
+
+    def run(self, choice: Any, others: list[Path], say: Callable[[str], None]) -> dict[str, Any]:
+        from vatmart_jax.bench import bench_perception
+
+        return bench_perception(choice, self.preset, self.seed, self.seconds)
+
+
+_BENCHES: dict[str, Any] = {"physics": _BenchPhysics, "parity": _BenchParity, "perception": _BenchPerception}
+
+
 COMMANDS: dict[str, Callable[[list[str]], None]] = {
     "convert": _convert,
     "generate": _generate,
     "train": _train,
     "evaluate": _evaluate,
+    "play": _play,
+    "bench": _bench,
 }
 
 
