@@ -16,7 +16,7 @@ import sys
 import time
 import traceback
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass, fields, replace
 from importlib.metadata import version
 from multiprocessing.connection import Connection, wait
 from pathlib import Path
@@ -29,9 +29,9 @@ from conversion import partnet
 from conversion.boxes import boxes
 from conversion.budget import joined, within_budget
 from conversion.decompose import DecomposeConfig, Surface, decompose, fidelity
-from conversion.handles import handles
+from conversion.handles import Handle, handles
 from conversion.mjcf import MjcfConfig, to_mjcf
-from conversion.partnet import ConvertedObject, ObjectError
+from conversion.partnet import ConvertedObject, Hull, ObjectError, Part, PartNetObject
 from conversion.report import contact_sheet, page, picture, read_png, save_png
 from conversion.scenes import scene_bank
 from conversion.views import views
@@ -65,7 +65,7 @@ class ConvertConfig(DecomposeConfig, MjcfConfig, ViewConfig):
     variants: int = 2
     """Scenes per door or drawer: all other parts closed, then with some of them open."""
     allow_missing: bool = False
-    """Convert objects with missing meshes, without them."""
+    """Convert links that lack more than half of their meshes, too, without these. Fewer are left out and noted."""
     continuous_range: bool = False
     """Let joints without a limit turn or slide without end, instead of refusing the object."""
     time_limit: float = 120.0
@@ -193,15 +193,15 @@ def _convert_one(folder: Path, out: Path, config: ConvertConfig, split: str | No
     start = time.process_time()
     obj = partnet.read_object(folder, continuous_range=config.continuous_range, allow_missing=config.allow_missing)
     parts, left_out = partnet.parts(obj)
-    hulls, groups = {}, {}
+    hulls, groups, found = {}, {}, []
     for root in obj.groups:
         budget = config.static_budget if root == obj.root else config.part_budget
         hulls[root] = []
         if visuals := obj.group_visuals(root):
             surface = Surface(visuals, config.seed)
-            hulls[root] = decompose(surface, budget, config)
-            if config.collision == "box":
-                hulls[root] = boxes(surface, hulls[root], 2 * budget, config)
+            part = next((p for p in parts if p.link == root), None)
+            hulls[root], passable = _shapes(obj, part, surface, budget, config)
+            found += passable
             groups[root] = {"hulls": len(hulls[root]), "budget": budget, **asdict(fidelity(surface, hulls[root]))}
     split = split or default_split(obj.category, obj.id)
     converted = ConvertedObject(obj, hulls, parts, left_out, split)
@@ -221,7 +221,7 @@ def _convert_one(folder: Path, out: Path, config: ConvertConfig, split: str | No
         "left_out": [{"joint": j, "reason": why} for j, why in left_out],
         "notes": obj.notes,
         "groups": groups,
-        "handles": [asdict(h) for h in handles(converted)],
+        "handles": [asdict(h) for h in found],
         "scenes": len(bank),
         "merged_scenes": [asdict(s) for s in slots],
         "seconds": round(time.process_time() - start, 3),  # of one core
@@ -239,6 +239,30 @@ def _convert_one(folder: Path, out: Path, config: ConvertConfig, split: str | No
         part.rename(out / obj.id)
     finally:
         shutil.rmtree(part, ignore_errors=True)
+
+
+def _shapes(
+    obj: PartNetObject, part: Part | None, surface: Surface, budget: int, config: ConvertConfig
+) -> tuple[list[Hull], list[Handle]]:
+    """Collision geometry of one group; finer where a finger would no longer pass behind a handle of a part."""
+    best: tuple[list[Hull], list[Handle]] | None = None
+    for share in (1, 2, 4):
+        finer = replace(
+            config,
+            handle_tolerance=config.handle_tolerance / share,
+            handle_merge_tolerance=config.handle_merge_tolerance / share,
+        )
+        hulls = decompose(surface, budget, finer)
+        if config.collision == "box":
+            hulls = boxes(surface, hulls, 2 * budget, finer)
+        found = handles(obj, part, hulls) if part else []
+        lost = lambda found: sum(h.visual and not h.hulls for h in found)  # noqa: E731
+        if best is None or lost(found) < lost(best[1]):
+            best = hulls, found
+        if not lost(found):
+            break
+    assert best is not None
+    return best
 
 
 def _banks(

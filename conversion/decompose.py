@@ -10,7 +10,7 @@ in free space, its distance from the visual surface) and *gap* (visual surface o
 from __future__ import annotations
 
 import heapq
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Literal
@@ -24,6 +24,8 @@ from scipy.spatial import ConvexHull, KDTree, QhullError
 from conversion.partnet import Hull, Visual, clean
 
 MAX_DISTANCE = 0.1  # farther from the surface, how far no longer matters, and searching gets slow
+_R2 = np.array([0.7548776662466927, 0.5698402909980532])
+SHEET = 2e-4  # thickness of flat patches while they grow; what stays flat gets more in the end
 MAX_ROUNDING = 0.003  # hulls merge freely only where the vertex limit costs no more surface than this
 
 
@@ -38,7 +40,9 @@ class DecomposeConfig:
     handle_tolerance: float = 0.008
     """The same for handles, knobs and pulls."""
     merge_tolerance: float = 0.008
-    """Hulls merge freely where the result reaches no farther than this into free space (half of it for handles)."""
+    """Hulls merge freely where the result reaches no farther than this into free space."""
+    handle_merge_tolerance: float = 0.004
+    """The same for handles, knobs and pulls."""
     max_vertices: int = 32
     """Vertices per hull."""
     thickness: float = 0.003
@@ -59,11 +63,15 @@ class Fidelity:
 def decompose(surface: Surface, budget: int, config: DecomposeConfig) -> list[Hull]:
     """Convex hulls of one rigid group, at most `budget` of them. Handles are merged with handles only."""
     visuals = surface.visuals
+    bars = [v for v in visuals if v.is_handle]
+    # Fingers go between a handle and its board: what its hulls may fill is told from the handle alone, and finer.
+    own = Surface(bars, finest=0.002) if bars else surface
     pieces: list[_Piece] = []
     for visual in visuals:
         if len(visuals) == 1 or not surface.hidden(visual):
-            pieces += _leaf(visual, surface, config)
-    return [Hull(_few_vertices(p.points, config)[0], p.is_handle) for p in _within(pieces, surface, budget, config)]
+            pieces += _leaf(visual, own if visual.is_handle else surface, config)
+    kept = _within(pieces, surface, own, budget, config)
+    return [Hull(_few_vertices(_thickened(p.points, config.thickness), config)[0], p.is_handle) for p in kept]
 
 
 def merged(
@@ -76,7 +84,7 @@ def merged(
     pieces = [_Piece.of(h.vertices, config.thickness / 2, h.is_handle) for h in hulls]
     number = {id(p): i for i, p in enumerate(pieces)}
     kept, new = [], []
-    for piece in _within(pieces, surface, budget, config):
+    for piece in _within(pieces, surface, surface, budget, config):
         if id(piece) in number:
             kept.append(number[id(piece)])
         else:
@@ -84,11 +92,16 @@ def merged(
     return sorted(kept), new
 
 
-def _within(pieces: list[_Piece], surface: Surface, budget: int, config: DecomposeConfig) -> list[_Piece]:
+def _within(
+    pieces: list[_Piece], surface: Surface, of_handles: Surface, budget: int, config: DecomposeConfig
+) -> list[_Piece]:
     handles = [p for p in pieces if p.is_handle]
-    others = [p for p in pieces if not p.is_handle]
-    handles = _merge(handles, surface, config.merge_tolerance / 2, max(4, budget // 2), config)
-    return _merge(others, surface, config.merge_tolerance, max(1, budget - len(handles)), config) + handles
+    others = _merge([p for p in pieces if not p.is_handle], surface, config.merge_tolerance, budget, config)
+    room = max(4, budget // 2, budget - len(others))
+    handles = _merge(handles, of_handles, config.handle_merge_tolerance, room, config)
+    if len(others) + len(handles) > budget:
+        others = _merge(others, surface, config.merge_tolerance, max(1, budget - len(handles)), config)
+    return others + handles
 
 
 class Surface:
@@ -98,14 +111,15 @@ class Surface:
     voxels: openings below about three voxels count as closed.
     """
 
-    def __init__(self, visuals: Sequence[Visual], seed: int = 0):
+    def __init__(self, visuals: Sequence[Visual], seed: int = 0, finest: float = 0.008):
+        """finest: smallest voxel; larger objects have larger ones."""
         self.visuals = visuals
         self.rng = np.random.default_rng(seed)
         start = np.cumsum([0] + [len(v.vertices) for v in visuals])
         vertices = np.concatenate([v.vertices for v in visuals])
         self.triangles = np.concatenate([v.vertices[v.faces] for v in visuals])  # [m, 3, 3]
         area = float(_areas(self.triangles).sum())
-        spacing = float(np.clip(np.sqrt(area / 20_000), 0.0015, 0.008))
+        spacing = float(np.clip(np.sqrt(area / 20_000), 0.0015, 0.012))
         points, owner = self.sample(self.triangles, int(np.clip(area / spacing**2, 500, 150_000)))
         points = np.concatenate([points, self.triangles.mean(axis=1)])
         self.owner = np.concatenate([owner, np.arange(len(self.triangles))])
@@ -113,25 +127,33 @@ class Surface:
         handles = [vertices[start[i] : start[i + 1]] for i, v in enumerate(visuals) if v.is_handle]
         self.handles = KDTree(np.concatenate(handles)) if handles else None
         low, high = vertices.min(axis=0), vertices.max(axis=0)
-        self.voxel = max(0.008, float((high - low).max()) / 160)
+        self.voxel = max(finest, float((high - low).max()) / 160)
         self.low = low - 4 * self.voxel
         self.shape = np.ceil((high - low) / self.voxel).astype(int) + 9
-        dense, _ = self.sample(self.triangles, int(np.clip(4 * area / self.voxel**2, 2000, 600_000)))
+        dense, _ = self.sample(self.triangles, int(np.clip(3 * area / self.voxel**2, 2000, 400_000)))
         occupied = np.zeros(self.shape, bool)
         occupied[tuple(self._cell(np.concatenate([dense, vertices])).T)] = True
         free = np.zeros(self.shape, np.int32)
-        ndimage.label(np.logical_not(ndimage.binary_dilation(occupied)), output=free)
+        ndimage.label(~_dilated(occupied), output=free)
         reached = free == free[0, 0, 0]
         self.layer = np.full(self.shape, 4, np.uint8)  # voxels between a cell and the space outside, 4 = further in
-        for k in (3, 2, 1, 0):
-            self.layer[np.asarray(ndimage.binary_dilation(reached, iterations=k) if k else reached, bool)] = k
+        self.layer[reached] = 0
+        for k in (1, 2, 3):
+            wider = _dilated(reached)
+            self.layer[wider & ~reached] = k
+            reached = wider
 
     def sample(self, triangles: np.ndarray, n: int) -> tuple[np.ndarray, np.ndarray]:
-        """n points [n, 3] spread evenly over triangles [m, 3, 3], and the triangle [n] of each."""
+        """n points [n, 3] spread evenly over triangles [m, 3, 3], and the triangle [n] of each.
+
+        Evenly also within a triangle (the R2 sequence, Roberts 2018): independent ones would leave holes.
+        """
         area = np.cumsum(_areas(triangles))
-        owner = np.searchsorted(area, (np.arange(n) + self.rng.random()) / n * area[-1]).clip(0, len(triangles) - 1)
-        uv = self.rng.random((n, 2))
-        uv[uv.sum(axis=1) > 1] = 1 - uv[uv.sum(axis=1) > 1]
+        index = np.arange(n)
+        owner = np.searchsorted(area, (index + self.rng.random()) / n * area[-1]).clip(0, len(triangles) - 1)
+        uv = (self.rng.random(2) + index[:, None] * _R2) % 1
+        folded = uv[:, 0] + uv[:, 1] > 1
+        uv[folded] = 1 - uv[folded]
         a, b, c = triangles[owner].transpose(1, 0, 2)
         return a + uv[:, :1] * (b - a) + uv[:, 1:] * (c - a), owner
 
@@ -149,45 +171,59 @@ class Surface:
 
     def distance(self, points: np.ndarray) -> np.ndarray:
         """Distance [n] to the surface, at most MAX_DISTANCE; exact for the triangles of the four nearest samples."""
-        return self._refined(points, *self._nearest(points), 0.0)
+        return self._refined(points, *self._nearest(points, MAX_DISTANCE), 0.0, MAX_DISTANCE)
 
-    def phantom(self, points: np.ndarray) -> np.ndarray:
-        """Distance [n] of points in reachable space to the surface, at most MAX_DISTANCE, 0 for points inside."""
-        near, index = self._nearest(points)
+    def phantom(self, points: np.ndarray, most: float = MAX_DISTANCE) -> np.ndarray:
+        """Distance [n] of points in reachable space to the surface, at most `most`, 0 for points inside."""
+        near, index = self._nearest(points, most)
         near[(near > 1.8 * self.voxel) & (self.layers(points) > 0)] = 0
-        return self._refined(points, near, index, 0.003)
+        return self._refined(points, near, index, 0.003, most)
 
-    def _nearest(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def _nearest(self, points: np.ndarray, most: float) -> tuple[np.ndarray, np.ndarray]:
         """Distance [n] to the nearest sample, and the triangles [n, 4] of the nearest four."""
-        near, index = map(np.asarray, self.tree.query(points, k=4, distance_upper_bound=MAX_DISTANCE))
-        return np.minimum(near[:, 0], MAX_DISTANCE), self.owner[np.minimum(index, len(self.owner) - 1)]
+        near, index = map(np.asarray, self.tree.query(points, k=4, distance_upper_bound=most))
+        return np.minimum(near[:, 0], most), self.owner[np.minimum(index, len(self.owner) - 1)]
 
-    def _refined(self, points: np.ndarray, near: np.ndarray, index: np.ndarray, above: float) -> np.ndarray:
-        rows = np.flatnonzero((near > above) & (near < MAX_DISTANCE))
+    def _refined(
+        self, points: np.ndarray, near: np.ndarray, index: np.ndarray, above: float, below: float
+    ) -> np.ndarray:
+        rows = np.flatnonzero((near > above) & (near < below))
         exact = _point_triangle(np.repeat(points[rows], 4, axis=0), self.triangles[index[rows].ravel()])
         near[rows] = np.minimum(near[rows], exact.reshape(-1, 4).min(axis=1)) if len(rows) else near[rows]
         return near
 
-    def worst(self, piece: _Piece, n: int) -> float:
+    def worst(self, piece: _Piece, n: int, config: DecomposeConfig) -> float:
         """Largest phantom of n samples of a hull. Where it is not itself a handle's, free space beside a handle counts
-        double: fingers go there."""
+        for more: fingers go there, and the tolerance is a handle's."""
         points = np.concatenate([self.sample(piece.triangles, n)[0], piece.triangles.mean(axis=1)])
         d = self.phantom(points)
         if self.handles is not None and not piece.is_handle:
             far = d > 0.003
-            d[far] *= 1 + (self.handles.query(points[far], distance_upper_bound=0.05)[0] < 0.05)
+            beside = self.handles.query(points[far], distance_upper_bound=0.05)[0] < 0.05
+            d[far] *= np.where(beside, config.tolerance / config.handle_tolerance, 1)
         return float(d.max())
 
     def harm(self, piece: _Piece, free: float) -> float:
         """Hull area times how much farther than `free` it reaches into free space: what a forced merge costs."""
         points, _ = self.sample(piece.triangles, 100)
-        excess = np.maximum(self.phantom(points) - free, 0)
+        reachable = points[self.layers(points) == 0]
+        excess = np.maximum(self.phantom(reachable, MAX_DISTANCE / 2) - free, 0).sum() / len(points)
         # The longest way counts a little, so that of merges without harm the compact one comes first.
-        return float(excess.mean() * _areas(piece.triangles).sum() + 1e-6 * np.ptp(piece.points, axis=0).max())
+        return float(excess * _areas(piece.triangles).sum() + 1e-6 * np.ptp(piece.points, axis=0).max())
 
     def reachable(self, piece: _Piece) -> bool:
         points, _ = self.sample(piece.triangles, 100)
         return bool((self.layers(np.concatenate([points, piece.points])) <= 3).any())
+
+
+def _dilated(cells: np.ndarray) -> np.ndarray:
+    """Cells [x, y, z] bool and those that share a face with one."""
+    out = cells.copy()
+    for axis in range(3):
+        a, b = np.moveaxis(out, axis, 0), np.moveaxis(cells, axis, 0)
+        a[1:] |= b[:-1]
+        a[:-1] |= b[1:]
+    return out
 
 
 def _areas(triangles: np.ndarray) -> np.ndarray:
@@ -240,7 +276,10 @@ class _Piece:
     @classmethod
     def of(cls, points: np.ndarray, thickness: float, is_handle: bool = False) -> _Piece:
         """Convex hull of points, padded where they are flat."""
-        points = _thickened(points, thickness)
+        return cls._hull(_thickened(points, thickness), is_handle)
+
+    @classmethod
+    def _hull(cls, points: np.ndarray, is_handle: bool) -> _Piece:
         try:
             hull = ConvexHull(points)
         except QhullError:  # rounding can still leave a sliver that Qhull calls flat
@@ -251,18 +290,18 @@ class _Piece:
         """Signed distance [n] to the planes: above 0 outside (a lower bound there), below 0 inside."""
         return (points @ self.planes[:, :3].T + self.planes[:, 3]).max(axis=1)
 
-    def joined(self, other: _Piece, thickness: float) -> _Piece:
-        return _Piece.of(np.concatenate([self.points, other.points]), thickness, self.is_handle)
+    def joined(self, other: _Piece) -> _Piece:
+        return _Piece._hull(np.concatenate([self.points, other.points]), self.is_handle)
 
     def rounding(self, config: DecomposeConfig) -> float:
         """How far vertices stick out of the hull of as many as are allowed."""
         return _few_vertices(self.points, config)[1] if len(self.points) > config.max_vertices else 0.0
 
-    def holds(self, other: _Piece, slack: float = 0.001) -> bool:
-        (low, high), (other_low, other_high) = self.bounds, other.bounds
-        if (other_low < low - slack).any() or (other_high > high + slack).any():
-            return False
-        return bool(self.outside(other.points).max() <= slack)
+    def holds(self, others: Sequence[_Piece], bounds: np.ndarray, slack: float = 0.001) -> list[int]:
+        """Which of the others, with bounds [n, 2, 3], lie inside this one."""
+        low, high = self.bounds
+        within = (bounds[:, 0] >= low - slack).all(axis=1) & (bounds[:, 1] <= high + slack).all(axis=1)
+        return [k for k in np.flatnonzero(within).tolist() if self.outside(others[k].points).max() <= slack]
 
 
 def _thickened(points: np.ndarray, thickness: float) -> np.ndarray:
@@ -310,15 +349,15 @@ def _few_vertices(points: np.ndarray, config: DecomposeConfig) -> tuple[np.ndarr
 def _leaf(visual: Visual, surface: Surface, config: DecomposeConfig) -> list[_Piece]:
     """One visual as hulls: its own, those of its components, or those that its patches grow into."""
     tolerance = config.handle_tolerance if visual.is_handle else config.tolerance
-    whole = _Piece.of(visual.vertices, config.thickness, visual.is_handle)
-    if surface.worst(whole, 300) <= tolerance:
+    whole = _Piece.of(visual.vertices, SHEET, visual.is_handle)
+    if surface.worst(whole, 300, config) <= tolerance:
         return [whole]
     if config.decomposer == "coacd":
         return _coacd(visual, config)
     out = []
     for vertices, faces in _components(visual.vertices, visual.faces):
-        piece = _Piece.of(vertices, config.thickness, visual.is_handle)
-        if surface.worst(piece, 300) <= tolerance:
+        piece = _Piece.of(vertices, SHEET, visual.is_handle)
+        if surface.worst(piece, 300, config) <= tolerance:
             out.append(piece)
         else:
             patches = _patches(*_coarse(vertices, faces, tolerance), surface, tolerance, visual.is_handle, config)
@@ -378,13 +417,21 @@ def _patches(
     shared = (edges[1:] == edges[:-1]).all(axis=1)
     pairs = np.stack([owner[:-1][shared], owner[1:][shared]], axis=1)
     flat = np.abs((normals[pairs[:, 0]] * normals[pairs[:, 1]]).sum(axis=1)) > 0.9995
+    patch = _connected(len(faces), pairs[flat])
+    # Curved surfaces are many small patches. Those within one cell reach less than the tolerance into free space
+    # together, and growing takes time per piece.
+    cell = 0.6 * tolerance
+    small = np.array([np.ptp(vertices[faces[rows]].reshape(-1, 3), axis=0).max() < cell for rows in _rows_by(patch)])
+    middle = np.array([vertices[faces[rows]].reshape(-1, 3).mean(axis=0) for rows in _rows_by(patch)])
+    _, box = np.unique(np.floor(middle / cell), axis=0, return_inverse=True)
+    patch = np.where(small, box.ravel(), len(small) + np.arange(len(small)))[patch]
     out = []
-    for rows in _rows_by(_connected(len(faces), pairs[flat])):
-        piece = _Piece.of(vertices[np.unique(faces[rows])], config.thickness, is_handle)
-        if len(rows) == 1 or surface.worst(piece, 60) <= tolerance:
+    for rows in _rows_by(patch):
+        piece = _Piece.of(vertices[np.unique(faces[rows])], SHEET, is_handle)
+        if len(rows) == 1 or surface.worst(piece, 60, config) <= tolerance:
             out.append(piece)
         else:
-            out += [_Piece.of(vertices[face], config.thickness, is_handle) for face in faces[rows]]
+            out += [_Piece.of(vertices[face], SHEET, is_handle) for face in faces[rows]]
     return out
 
 
@@ -400,13 +447,13 @@ def _coacd(visual: Visual, config: DecomposeConfig) -> list[_Piece]:
         resolution=1000,
         seed=0,
     )
-    return [_Piece.of(np.asarray(v, np.float64), config.thickness, visual.is_handle) for v, _ in parts if len(v)]
+    return [_Piece.of(np.asarray(v, np.float64), SHEET, visual.is_handle) for v, _ in parts if len(v)]
 
 
 def _grow(pieces: list[_Piece], surface: Surface, tolerance: float, config: DecomposeConfig) -> list[_Piece]:
     """Merge neighbours while phantom stays below the tolerance, what makes the smallest piece first."""
     active = dict(enumerate(pieces))
-    bounds = np.array([p.bounds for p in pieces])  # [n, 2, 3]
+    bounds = _bounds(pieces)
     heap: list[tuple[float, int, int]] = []
 
     def meet(i: int, others: np.ndarray) -> None:
@@ -422,15 +469,16 @@ def _grow(pieces: list[_Piece], surface: Surface, tolerance: float, config: Deco
         _, i, j = heapq.heappop(heap)
         if i not in active or j not in active:
             continue
-        merged = active[i].joined(active[j], config.thickness)
+        merged = active[i].joined(active[j])
         # Few samples first: most pairs fail by much.
-        if any(surface.worst(merged, n) > tolerance for n in (40, 160)):
+        if any(surface.worst(merged, n, config) > tolerance for n in (40, 160)):
             continue
         if merged.rounding(config) > MAX_ROUNDING:
             continue
         del active[i], active[j]
-        for k in [k for k, p in active.items() if merged.holds(p)]:
-            del active[k]
+        others = np.fromiter(active, int, len(active))
+        for k in merged.holds(list(active.values()), bounds[others]):
+            del active[int(others[k])]
         new = len(bounds)
         bounds = np.concatenate([bounds, [merged.bounds]])
         others = np.fromiter(active, int, len(active))
@@ -442,9 +490,12 @@ def _grow(pieces: list[_Piece], surface: Surface, tolerance: float, config: Deco
 def _merge(pieces: list[_Piece], surface: Surface, free: float, budget: int, config: DecomposeConfig) -> list[_Piece]:
     """Drop hulls that are inside others or out of reach, merge those that may, then the cheapest down to the budget."""
     kept: list[_Piece] = []
-    for piece in sorted(pieces, key=lambda p: -p.volume):
-        if not any(k.holds(piece) for k in kept):
-            kept.append(piece)
+    rest = sorted(pieces, key=lambda p: -p.volume)
+    while rest:
+        first, *rest = rest
+        kept.append(first)
+        inside = set(first.holds(rest, _bounds(rest)))
+        rest = [p for k, p in enumerate(rest) if k not in inside]
     if len(kept) > 1:
         kept = [p for p in kept if surface.reachable(p)] or kept[:1]
     kept = _absorb(_grow(kept, surface, free, config), surface, 3 * budget, config)
@@ -457,7 +508,7 @@ def _merge(pieces: list[_Piece], surface: Surface, free: float, budget: int, con
         low, high = active[i].bounds
         apart = [np.maximum(active[j].bounds[0] - high, low - active[j].bounds[1]).max() for j in others]
         for k in np.argsort(apart, kind="stable")[:12].tolist():
-            merged = active[i].joined(active[others[k]], config.thickness)
+            merged = active[i].joined(active[others[k]])
             heapq.heappush(heap, (surface.harm(merged, free), i, others[k], merged))
 
     for i in active:
@@ -468,8 +519,9 @@ def _merge(pieces: list[_Piece], surface: Surface, free: float, budget: int, con
         if i not in active or j not in active:
             continue
         del active[i], active[j]
-        for k in [k for k, p in active.items() if merged.holds(p)]:
-            del active[k]
+        others = list(active)
+        for k in merged.holds(list(active.values()), _bounds(active.values())):
+            del active[others[k]]
         others = list(active)
         active[number] = merged
         meet(number, others)
@@ -487,11 +539,18 @@ def _absorb(pieces: list[_Piece], surface: Surface, target: int, config: Decompo
             np.maximum(0, np.maximum(small.bounds[0] - p.bounds[1], p.bounds[0] - small.bounds[1])).max() for p in rest
         ]
         near = np.argsort(apart, kind="stable")[:6].tolist()
-        merged = {k: small.joined(rest[k], config.thickness) for k in near}
+        merged = {k: small.joined(rest[k]) for k in near}
         best = min(near, key=lambda k: surface.harm(merged[k], config.merge_tolerance))
         rest[best] = merged[best]
-        pieces = sorted((p for p in rest if p is merged[best] or not merged[best].holds(p)), key=size)
+        rest.append(rest.pop(best))
+        inside = set(merged[best].holds(rest[:-1], _bounds(rest[:-1])))
+        pieces = sorted((p for k, p in enumerate(rest) if k not in inside), key=size)
     return pieces
+
+
+def _bounds(pieces: Iterable[_Piece]) -> np.ndarray:
+    """[n, 2, 3]"""
+    return np.array([p.bounds for p in pieces]).reshape(-1, 2, 3)
 
 
 def fidelity(surface: Surface, hulls: Sequence[Hull]) -> Fidelity:

@@ -11,7 +11,7 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import ConvexHull
 from trimesh.ray.ray_pyembree import RayMeshIntersector
 
-from conversion.partnet import ConvertedObject, Part, Visual
+from conversion.partnet import Hull, Part, PartNetObject, Visual
 
 FINGER = 0.012  # thickness and width of the finger that must pass, unit lengths
 SPACING = 0.003  # of the rays
@@ -25,27 +25,20 @@ class Handle:
     hulls: bool  # and behind its hulls
 
 
-def handles(converted: ConvertedObject) -> list[Handle]:
-    """Every handle of every door and drawer. Bars only count where a finger passes across them, knobs never do."""
+def handles(obj: PartNetObject, part: Part, hulls: Sequence[Hull]) -> list[Handle]:
+    """Every handle of a door or drawer with these hulls. Bars only count where a finger passes across them."""
     out = []
-    for part in converted.parts:
-        visuals = converted.obj.group_visuals(part.link)
-        seen = _triangles([v for v in visuals if not v.is_handle])
-        hulls = converted.hulls[part.link]
-        solid = {k: [h.vertices for h in hulls if h.is_handle == k] for k in (False, True)}
-        for group in _clusters([v for v in visuals if v.is_handle]):
-            bar = _triangles(group)
-            behind = _behind(converted, part, bar, seen)
-            low, high = bar.reshape(-1, 3).min(axis=0) - 0.01, bar.reshape(-1, 3).max(axis=0) + 0.01
-            own = [h for h in solid[True] if ((h.max(axis=0) >= low) & (h.min(axis=0) <= high)).all()]
-            out.append(
-                Handle(
-                    part.link,
-                    group[0].name,
-                    passes(bar, bar, seen, behind),
-                    passes(bar, _surface(own), _surface(solid[False]), behind),
-                )
-            )
+    visuals = obj.group_visuals(part.link)
+    seen = _triangles([v for v in visuals if not v.is_handle])
+    solid = {k: [h.vertices for h in hulls if h.is_handle == k] for k in (False, True)}
+    for group in _clusters([v for v in visuals if v.is_handle]):
+        bar = _triangles(group)
+        behind = _behind(obj, part, bar, seen)
+        low, high = bar.reshape(-1, 3).min(axis=0) - 0.01, bar.reshape(-1, 3).max(axis=0) + 0.01
+        own = [h for h in solid[True] if ((h.max(axis=0) >= low) & (h.min(axis=0) <= high)).all()]
+        visual = passes(bar, bar, seen, behind)
+        kept = visual and passes(bar, _surface(own), _surface(solid[False]), behind)
+        out.append(Handle(part.link, group[0].name, visual, kept))
     return out
 
 
@@ -96,9 +89,9 @@ def _first(triangles: np.ndarray, origins: np.ndarray, direction: np.ndarray) ->
     return out.reshape(shape)
 
 
-def _behind(converted: ConvertedObject, part: Part, bar: np.ndarray, rest: np.ndarray) -> np.ndarray:
+def _behind(obj: PartNetObject, part: Part, bar: np.ndarray, rest: np.ndarray) -> np.ndarray:
     """Direction, link frame, from a handle to its door or drawer."""
-    axis = converted.obj.joints[part.link].axis
+    axis = obj.joints[part.link].axis
     if part.kind == "drawer":
         return -part.sign * axis
     centre = bar.reshape(-1, 3).mean(axis=0)

@@ -304,8 +304,8 @@ class _Reader:
 def read_object(folder: Path, *, continuous_range: bool = False, allow_missing: bool = False) -> PartNetObject:
     """Read `mobility.urdf` (or `mobility_vhacd.urdf`), its visual meshes and the annotation beside it.
 
-    continuous_range: a joint without limits may move without end. allow_missing: go on without missing meshes.
-    Raises ObjectError.
+    continuous_range: a joint without limits may move without end. A link may lack up to half of its meshes, which is
+    noted; allow_missing: or any number. Raises ObjectError.
     """
     reader = _Reader(Path(folder), continuous_range, allow_missing)
     names = ("mobility.urdf", "mobility_vhacd.urdf")
@@ -468,9 +468,10 @@ def _visuals(reader: _Reader, urdf: str, link: yourdfpy.Link) -> Iterator[Visual
         words = f"{visual.name or ''} {link.name}".lower()
         yield Visual(name, vertices, faces, any(w in words for w in HANDLE_WORDS), file)
     if missing:
-        reader.notes.append(f"link {link.name!r}: {len(missing)} of {len(wanted)} meshes missing, as {missing[0]}")
-        if not reader.allow_missing:
-            raise reader.error(f"mesh of link {link.name!r} is missing; restore it or pass --allow-missing", missing[0])
+        what = f"link {link.name!r}: {len(missing)} of {len(wanted)} meshes missing"
+        if 2 * len(missing) > len(wanted) and not reader.allow_missing:
+            raise reader.error(f"{what}; restore them or pass --allow-missing", missing[0])
+        reader.notes.append(f"{what}, left out: {', '.join(missing[:3])}")
     if empty:
         reader.notes.append(f"link {link.name!r}: {len(empty)} meshes without surface, ignored")
 
