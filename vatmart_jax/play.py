@@ -14,6 +14,7 @@ import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
+from jax.experimental import io_callback
 
 from vatmart_jax import geometry as g
 from vatmart_jax.bank import HINGE, SceneBank, ViewBank
@@ -44,21 +45,22 @@ class Recording:
 
 
 class _Recorder:
-    """Physics that keeps qpos every few steps of trials that run eagerly."""
+    """Physics that keeps qpos of the first simulation every few steps."""
 
     def __init__(self, physics: Physics):
         self.config, self.frames = physics.config, []
         self._physics = physics
 
     def reset(self, scene: jax.Array, gripper_pose: jax.Array, qpos: jax.Array) -> PhysicsState:
-        state = self._physics.reset(scene, gripper_pose, qpos)
-        self.frames.append(np.asarray(state.qpos[0]))
-        return state
+        return self._keep(self._physics.reset(scene, gripper_pose, qpos))
 
     def rollout(self, state: PhysicsState, ctrl: jax.Array, active: jax.Array) -> PhysicsState:
-        for first in range(0, ctrl.shape[1], EVERY):
-            state = self._physics.rollout(state, ctrl[:, first : first + EVERY], active)
-            self.frames.append(np.asarray(state.qpos[0]))
+        pieces = ctrl.reshape(len(ctrl), -1, EVERY, ctrl.shape[-1]).swapaxes(0, 1)
+        run = lambda state, piece: (self._keep(self._physics.rollout(state, piece, active)), None)  # noqa: E731
+        return jax.lax.scan(run, state, pieces)[0]
+
+    def _keep(self, state: PhysicsState) -> PhysicsState:
+        io_callback(lambda qpos: self.frames.append(np.asarray(qpos)), None, state.qpos[0], ordered=True)
         return state
 
 
@@ -167,8 +169,8 @@ def record(env: Env, start: Start, trajectory: jax.Array) -> Recording:
     env.physics = recorder = _Recorder(physics)
     try:
         rotation, residuals = g.unpack_trajectory(trajectory)
-        with jax.disable_jit():  # the recorder looks at numbers
-            end = env.execute(start.replace(rotation=rotation), residuals)
+        end = jax.jit(env.execute)(start.replace(rotation=rotation), residuals)
+        jax.effects_barrier()
     finally:
         env.physics = physics
     scene, view = int(end.physics.scene[0]), int(start.view[0])
