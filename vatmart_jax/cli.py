@@ -248,6 +248,11 @@ def _play(argv: list[str]) -> None:
 def _bench(argv: list[str]) -> None:
     """Measure speed and agreement: bench physics, parity or perception."""
     what = argv[0] if argv else ""
+    if what in ("-h", "--help"):
+        rows = "\n".join(f"  {name:<10} {(kind.__doc__ or '').strip()}" for name, kind in _BENCHES.items())
+        flags = "`vatmart bench WHAT --help` lists the flags of one, --json among them."
+        print(f"usage: vatmart bench WHAT [flags]\n\n{rows}\n\n{flags}")
+        sys.exit(0)
     if what not in _BENCHES:
         raise UserError(f"bench {what}: say what to measure, one of {', '.join(_BENCHES)}")
     args = tyro.cli(_BENCHES[what], args=argv[1:], prog=f"vatmart bench {what}")
