@@ -39,7 +39,7 @@ class Recording:
     model: mujoco.MjModel  # the Scene's own
     gripper_pose: np.ndarray  # [7]
     qpos: np.ndarray  # [F, 9]
-    path: np.ndarray  # [6, 3] the contact point, then the commanded fingertips: start pose and waypoints
+    path: np.ndarray  # [7, 3] contact point, then where the fingertips were sent: start, grasp (pull), waypoints
     azimuth: float  # rad, of the camera that took the view
     state: EnvState  # the end, B = 1
 
@@ -176,8 +176,11 @@ def record(env: Env, start: Start, trajectory: jax.Array) -> Recording:
     scene, view = int(end.physics.scene[0]), int(start.view[0])
     hand = np.asarray(end.physics.gripper_pose[0])
     tip = np.asarray(end.point - env.config.standoff * end.start.rotation[:, :, 2])[0]
-    moves = np.cumsum(np.asarray(residuals[0, :, :3]), 0)
-    path = np.concatenate([np.asarray(end.point), tip[None], tip + moves])
+    # Backwards from where the fingertips were last sent, so that a grasp's advance is in it.
+    moves = np.asarray(residuals[0, ::-1, :3])
+    path = np.concatenate(
+        [np.asarray(end.point), tip[None], (tip + end.tip - np.cumsum(moves, 0))[::-1], tip + end.tip]
+    )
     model = scene_model(env.bank, scene, physics.config)
     return Recording(model, hand, np.stack(recorder.frames), path, float(env.views.azimuth[view]), end)
 

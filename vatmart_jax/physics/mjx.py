@@ -23,8 +23,6 @@ NEAR = (2, 3)
 RENEW = 4
 # Its Newton solver runs for the slowest of the batch, and its line search always to the end.
 ITERATIONS, LS_ITERATIONS = 5, 5
-# Twisting is resisted by manifolds of up to four points: two rows per contact are saved.
-CONDIM = 3
 
 
 class Slots(NamedTuple):
@@ -59,7 +57,6 @@ class MjxPhysics:
         model.opt.iterations, model.opt.ls_iterations = ITERATIONS, LS_ITERATIONS
         boxes = [model.geom(name).id for name in BOXES]
         near, own = sum(counts), np.concatenate([np.repeat(np.arange(len(BOXES)), n) for n in self._near])
-        model.geom_condim[:] = CONDIM
         model.geom_contype[:near], model.geom_conaffinity[:near] = 0, 1 << own
         model.geom_contype[boxes], model.geom_conaffinity[boxes] = 1 << np.arange(len(BOXES)), 0
         self._meshes = _convex_meshes(full.model) if bank.collision == "hull" else None
