@@ -301,6 +301,7 @@ class _Reader:
             return None
 
 
+@np.errstate(invalid="ignore", over="ignore")  # what is not finite is refused by name
 def read_object(folder: Path, *, continuous_range: bool = False, allow_missing: bool = False) -> PartNetObject:
     """Read `mobility.urdf` (or `mobility_vhacd.urdf`), its visual meshes and the annotation beside it.
 

@@ -132,7 +132,9 @@ th, td {{ padding: 4px 10px; border-bottom: 1px solid #ddd; text-align: left; ve
 th {{ cursor: pointer; position: sticky; top: 0; background: #f4f4f4 }}
 td.n {{ text-align: right; font-variant-numeric: tabular-nums }}
 td.bad {{ background: #fbe3dd }}
-img {{ width: 640px; display: block }}
+img {{ width: 520px; display: block }}
+td:last-child {{ max-width: 26em }}
+td:last-child small {{ display: block; max-height: 9em; overflow: auto }}
 small {{ color: #666 }}
 </style>
 <h1>Conversion report</h1>

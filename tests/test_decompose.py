@@ -44,12 +44,12 @@ def tray(wall: float) -> list[Visual]:
     return [Visual("tray-1", *clean(vertices, faces), False, None)]
 
 
-def handle(name: str = "handle-1") -> Visual:
-    """A bar on two posts, 0.04 in front of a board whose front is at x = 0."""
+def handle(name: str = "handle-1", room: float = 0.04) -> Visual:
+    """A bar on two posts, `room` in front of a board whose front is at x = 0."""
     boxes = [
-        box(name, (-0.06, 0.3, 0.45), (-0.04, 0.7, 0.47)),
-        box(name, (-0.04, 0.3, 0.45), (0, 0.32, 0.47)),
-        box(name, (-0.04, 0.68, 0.45), (0, 0.7, 0.47)),
+        box(name, (-room - 0.02, 0.3, 0.45), (-room, 0.7, 0.47)),
+        box(name, (-room, 0.3, 0.45), (0, 0.32, 0.47)),
+        box(name, (-room, 0.68, 0.45), (0, 0.7, 0.47)),
     ]
     start = np.cumsum([0] + [len(b.vertices) for b in boxes])
     return Visual(
@@ -84,10 +84,12 @@ def test_flat_sheets_become_thick_enough_to_collide():
     assert np.ptp(hull.vertices[:, 2]) == pytest.approx(CONFIG.thickness)
 
 
-def test_the_gap_behind_a_handle_stays_free_and_handles_stay_apart():
-    hulls = hulls_of([box("door-2", (0, 0, 0), (0.03, 1, 1)), handle()])
+@pytest.mark.parametrize("room", [0.04, 0.015])
+def test_the_gap_behind_a_handle_stays_free_and_handles_stay_apart(room):
+    """Also a gap that is narrower than two voxels of its door, and of which half is near the door's surface."""
+    hulls = hulls_of([box("door-2", (0, 0, 0), (0.03, 1, 1)), handle(room=room)])
     assert sum(h.is_handle for h in hulls) == 3
-    gap = np.random.default_rng(0).uniform((-0.037, 0.33, 0.45), (-0.003, 0.67, 0.47), (500, 3))
+    gap = np.random.default_rng(0).uniform((-room + 1e-3, 0.33, 0.45), (-1e-3, 0.67, 0.47), (500, 3))
     assert not covered(hulls, gap).any()
 
 
