@@ -17,6 +17,7 @@ from dataclasses import dataclass
 import jax
 import jax.numpy as jnp
 import numpy as np
+import trimesh
 from flax import struct
 
 from vatmart_jax import geometry as g
@@ -27,6 +28,7 @@ from vatmart_jax.physics.controller import hand_target, waypoint_controls
 from vatmart_jax.physics.template import FINGER_OPEN, FINGERS, HAND, PART, TIP
 
 OBSERVATION, ACTION = 33, 6
+_HANDLE_POINTS, _HAND_REACH = 200, 0.05  # per shape of a handle; unit lengths about the contact
 MIN_PUSHABLE = 4  # of a view's contacts; with fewer, it hardly shows where to push
 
 
@@ -70,10 +72,11 @@ class EnvConfig:
     """fingertips start this far from the contact point"""
     cone: float = float(np.radians(30))
     """the hand approaches within this angle of the inward normal"""
-    grasp_depth: float = 0.025
+    grasp_depth: float = 0.04
     """pulling: the open fingers advance this far past the contact point before they close"""
-    grasp_min: float = 0.003
-    """opening between closed fingers from which on something is held"""
+    grasp_min: float = 0.01
+    """opening between closed fingers from which on something is held, as in the released code; at less, four in five
+    pulls slip"""
     guided_share: float = 0.9
     """share of starts that are promising. Push: the contact's face points against the motion. Pull: a handle grasped
     from the front across its thin side, or an edge of the part straddled along the motion"""
@@ -479,38 +482,39 @@ def grasps(bank: SceneBank, views: ViewBank) -> tuple[np.ndarray, np.ndarray]:
     """The straight grasp at every contact: approach direction [V, C, 3] and the axis along which the fingers close
     [V, C, 3], float32 unit, object frame.
 
-    A handle is approached against the opening motion, the fingers closing across the thin side of the handle's shape
-    next to the contact. Elsewhere the hand comes along the inward normal and the fingers close along the motion.
+    A handle is approached against the opening motion, the fingers closing across the thin side of what of the handle
+    is within their reach. Elsewhere the hand comes along the inward normal and the fingers close along the motion.
     """
     motion, _ = _motion(bank, views)
     up = np.where(views.contact_handle[..., None], -motion, -views.contact_normals)
     across = motion.copy()
-    shapes = {s: _handle_shapes(bank, s) for s in np.unique(views.scene).tolist()}
+    surfaces = {s: _handle_surface(bank, s) for s in np.unique(views.scene).tolist()}
     for view in np.flatnonzero(views.contact_handle.any(1)):
         scene = int(views.scene[view])
         rows = np.flatnonzero(views.contact_handle[view])
         # Contacts and directions in the part's frame, where its shapes are.
         rotation, position = _part_pose(bank, scene, float(views.q[view]))
         contact = (views.contacts[view, rows] - position) @ rotation
-        if shapes[scene]:
-            local = _thin_axes(shapes[scene], contact, up[view, rows] @ rotation)
+        if len(surfaces[scene]):
+            local = _thin_axes(surfaces[scene], contact, up[view, rows] @ rotation)
             across[view, rows] = local @ rotation.T
     across -= (across * up).sum(-1, keepdims=True) * up
     across /= np.maximum(np.linalg.norm(across, axis=-1, keepdims=True), 1e-6)
     return up.astype(np.float32), across.astype(np.float32)
 
 
-def _handle_shapes(bank: SceneBank, scene: int) -> list[np.ndarray]:
-    """Vertices [n, 3] of the moving part's handle shapes, part frame."""
+def _handle_surface(bank: SceneBank, scene: int) -> np.ndarray:
+    """Points [n, 3] spread over the moving part's handle shapes, part frame."""
     rows = np.arange(bank.part_start[scene], bank.part_start[scene + 1])
-    found = []
+    found = [np.zeros((0, 3))]
     for row in rows[bank.instance_handle[rows]]:
         shape = int(bank.instance_shape[row])
         corners = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
         vertices = bank.hull(shape) if bank.collision == "hull" else corners * bank.box_size[shape]
+        surface = trimesh.sample.sample_surface(trimesh.convex.convex_hull(vertices), _HANDLE_POINTS, seed=0)[0]
         rotation = np.asarray(g.matrix_from_quat(jnp.asarray(bank.instance_quat[row], jnp.float32)))
-        found.append(vertices @ rotation.T + bank.instance_pos[row])
-    return found
+        found.append(surface @ rotation.T + bank.instance_pos[row])
+    return np.concatenate(found)
 
 
 def _part_pose(bank: SceneBank, scene: int, q: float) -> tuple[np.ndarray, np.ndarray]:
@@ -522,21 +526,19 @@ def _part_pose(bank: SceneBank, scene: int, q: float) -> tuple[np.ndarray, np.nd
     return rotation, position + rotation @ axis * q
 
 
-def _thin_axes(shapes: list[np.ndarray], contacts: np.ndarray, up: np.ndarray) -> np.ndarray:
-    """[n, 3] for contacts [n, 3]: the direction across `up` [n, 3] in which the nearest shape is thinnest."""
-    distance = [np.linalg.norm(contacts - np.clip(contacts, v.min(0), v.max(0)), axis=-1) for v in shapes]
-    nearest = np.argmin(distance, axis=0)
+def _thin_axes(surface: np.ndarray, contacts: np.ndarray, up: np.ndarray) -> np.ndarray:
+    """[n, 3] for contacts [n, 3]: the direction across `up` [n, 3] in which the surface near the contact is thin."""
     side = np.where(np.abs(up[:, 2:]) < 0.9, [[0.0, 0.0, 1.0]], [[0.0, 1.0, 0.0]])
     x = np.cross(side, up)
     x /= np.linalg.norm(x, axis=-1, keepdims=True)
     angle = np.linspace(0, np.pi, 24, endpoint=False)[:, None, None]
     directions = np.cos(angle) * x + np.sin(angle) * np.cross(up, x)  # [24, n, 3]
-    out = np.zeros_like(contacts)
-    for shape in np.unique(nearest):
-        rows = np.flatnonzero(nearest == shape)
-        extent = np.ptp(directions[:, rows] @ shapes[shape].T, axis=-1)
-        out[rows] = directions[extent.argmin(0), rows]
-    return out
+    offset = surface - contacts[:, None]  # [n, p, 3]
+    distance = np.linalg.norm(offset, axis=-1)
+    near = distance < np.maximum(_HAND_REACH, distance.min(-1, keepdims=True) + 0.01)
+    along = np.einsum("anj,npj->anp", directions, offset)
+    extent = np.where(near, along, -np.inf).max(-1) - np.where(near, along, np.inf).min(-1)
+    return directions[extent.argmin(0), np.arange(len(contacts))]
 
 
 def _balanced(bank: SceneBank, views: ViewBank) -> np.ndarray:

@@ -288,6 +288,42 @@ def propose_trajectories(
     return _over_rows(propose, view, contact, task, jax.random.split(key, len(view)))
 
 
+@partial(jax.jit, static_argnames=("networks", "n_proposals"))
+def explore_actions(
+    networks: Networks,
+    params: Params,
+    clouds: Clouds,
+    view: jax.Array,
+    contact: jax.Array,
+    task: jax.Array,
+    key: jax.Array,
+    n_proposals: int = 100,
+) -> tuple[jax.Array, jax.Array]:
+    """What to try for views [V], T tasks in each [V, T]; one encoder pass per view serves all of them.
+
+    Of four tasks in a row, the first gets what `select_actions` would choose; the second the best proposal at a contact
+    drawn by actionability, the third at the given contact [V, T], and the last any proposal there. Returns contacts
+    [V, T] and trajectories [V, T, 30]. Consumes the key.
+    """
+
+    def explore(view: jax.Array, contact: jax.Array, task: jax.Array, key: jax.Array) -> tuple[jax.Array, jax.Array]:
+        k_contact, k_proposals, k_pick = jax.random.split(key, 3)
+        contacts = clouds.contacts[view]
+        f = _encode(networks, params, clouds, view)
+        logits = networks.actionability(params, f, contacts, task[:, None])  # [T, C]
+        kind = jnp.arange(len(task)) % 4
+        drawn = jax.random.categorical(k_contact, jax.nn.log_sigmoid(logits))
+        contact = jnp.select([kind == 0, kind == 1], [jnp.argmax(logits, -1), drawn], contact).astype(jnp.int32)
+        at = Features(*(x[contact][:, None] for x in f))
+        trajectory, score = _proposals(
+            networks, params, at, contacts[contact][:, None], task[:, None], k_proposals, n_proposals
+        )
+        pick = jnp.where(kind == 3, jax.random.randint(k_pick, kind.shape, 0, n_proposals), score.argmax(-1))
+        return contact, trajectory[jnp.arange(len(task)), pick]
+
+    return _over_rows(explore, view, contact, task, jax.random.split(key, len(view)))
+
+
 @partial(jax.jit, static_argnames=("networks",))
 def score_trajectories(
     networks: Networks,

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -11,7 +10,7 @@ import jax.numpy as jnp
 from vatmart_jax import geometry as g
 from vatmart_jax.env import Env, EnvState, Start
 from vatmart_jax.perception.networks import Networks, Params
-from vatmart_jax.perception.train import Clouds, Samples, propose_trajectories, select_actions
+from vatmart_jax.perception.train import Clouds, Samples, explore_actions, select_actions
 
 
 def samples_of(final: EnvState, trajectory: jax.Array | None = None) -> Samples:
@@ -39,17 +38,26 @@ def curious(samples: Samples, score: jax.Array, tolerance: float) -> Samples:
     return samples.replace(view=jnp.where(novel | known | failed, samples.view, -1))
 
 
+TASKS_PER_VIEW = 8
+
+
 class ProposalTrials:
     """Executes what the networks propose in an environment whose views are `clouds`."""
 
     def __init__(self, env: Env, clouds: Clouds, networks: Networks, proposals: int):
         self._env, self._clouds, self._networks, self._proposals = env, clouds, networks, proposals
         self._execute = jax.jit(self._executed)
-        self._sample = jax.jit(lambda key: env.sample(key, env.config.batch))
+        self._sample_by_view = jax.jit(self._sampled_by_view)
 
     def _executed(self, start: Start, trajectory: jax.Array) -> EnvState:
         rotation, residuals = g.unpack_trajectory(trajectory)
         return self._env.execute(start.replace(rotation=rotation), residuals)
+
+    def _sampled_by_view(self, key: jax.Array) -> Start:
+        """A batch of starts in which every TASKS_PER_VIEW in a row share a view."""
+        kv, ka = jax.random.split(key)
+        view = jnp.repeat(self._env.sample(kv, max(1, self._env.config.batch // TASKS_PER_VIEW)).view, TASKS_PER_VIEW)
+        return self._env.approach(ka, view, self._env.sample_task(kv, view), self._env.config.guided_share)
 
     def best(self, params: Params, start: Start, key: jax.Array) -> tuple[EnvState, jax.Array, jax.Array]:
         """The networks' choice for the views and tasks of `start`: final states, trajectories [B, 30], scores [B].
@@ -60,25 +68,18 @@ class ProposalTrials:
         final = self._execute(replace(start, contact=chosen.contact), chosen.trajectory)
         return final, chosen.trajectory, chosen.score
 
-    def explore(self, params: Params, key: jax.Array) -> tuple[EnvState, Samples]:
-        """A batch of random views and tasks: half the networks' choice, half at random contacts, there half the best
-        and half any proposal. Consumes the key.
+    def explore(self, params: Params, key: jax.Array) -> tuple[EnvState, Samples, jax.Array]:
+        """A batch of trials to learn from, several tasks in each random view: see `explore_actions`.
+
+        Returns final states, samples, and which of them [B] bool are the networks' choice. Consumes the key.
         """
-        ks, kb, kp, kc = jax.random.split(key, 4)
-        start = self._sample(ks)
-        chosen = select_actions(self._networks, params, self._clouds, start.view, start.task, kb, self._proposals)
-        proposed, score = propose_trajectories(
-            self._networks, params, self._clouds, start.view, start.contact, start.task, kp, self._proposals
-        )
-        contact, trajectory = _mixed(chosen, start.contact, proposed, score, kc)
-        final = self._execute(replace(start, contact=contact), trajectory)
-        return final, samples_of(final, trajectory)
-
-
-@partial(jax.jit)
-def _mixed(chosen, contact, proposed, score, key):
-    rows = jnp.arange(len(contact))
-    own, best = rows % 2 == 0, rows % 4 == 1
-    pick = jnp.where(best, score.argmax(1), jax.random.randint(key, contact.shape, 0, score.shape[1]))
-    trajectory = jnp.where(own[:, None], chosen.trajectory, proposed[rows, pick])
-    return jnp.where(own, chosen.contact, contact), trajectory
+        ks, ke = jax.random.split(key)
+        start = self._sample_by_view(ks)
+        rows = (-1, TASKS_PER_VIEW)
+        contact, trajectory = explore_actions(
+            self._networks, params, self._clouds, start.view.reshape(rows)[:, 0], start.contact.reshape(rows),
+            start.task.reshape(rows), ke, self._proposals,
+        )  # fmt: skip
+        trajectory = trajectory.reshape(len(start.view), -1)
+        final = self._execute(replace(start, contact=contact.reshape(-1)), trajectory)
+        return final, samples_of(final, trajectory), jnp.arange(len(trajectory)) % 4 == 0

@@ -203,8 +203,8 @@ class Training:
             rates = []
             for batch in range(schedule.finetune_batches):
                 key = self.key("finetune", done * schedule.finetune_batches + batch)
-                _, found = trials.explore(progress.perception.params, key)
-                rates.append(float(found.success(self._env.config.tolerance)[::2].mean()))
+                _, found, chosen = trials.explore(progress.perception.params, key)
+                rates.append(float(found.success(self._env.config.tolerance)[chosen].mean()))
                 progress = _store(progress, found)
             progress, losses = self._round(progress, schedule.finetune_steps)
             metrics = {"success": float(np.mean(rates))} | losses
