@@ -141,7 +141,9 @@ def _train(argv: list[str]) -> None:
     config = resolve(args.task, args.preset, args.impl, args.seed, args.settings, args.data)
     check_folder(args.out, config)
     with Bars() as bars:
-        result, table = train(config, args.settings, _prepared(args.data, bars.say), args.out, bars)
+        points = args.settings.perception.networks.pointnet.n_points
+        folder = _prepared(args.data, bars.say, points)
+        result, table = train(config, args.settings, folder, args.out, bars)
     _print_result(result, args.json, table)
 
 
@@ -340,11 +342,89 @@ class _BenchPerception(_Bench):
 _BENCHES: dict[str, Any] = {"physics": _BenchPhysics, "parity": _BenchParity, "perception": _BenchPerception}
 
 
+def _predict(argv: list[str]) -> None:
+    """Ask trained priors about a point cloud."""
+
+    @dataclass(frozen=True)
+    class Predict:
+        """Where to touch a partial point cloud for a task, which trajectories to try, and how likely each works."""
+
+        priors: Positional[Path]
+        """run folder of `vatmart train`, or a folder of priors"""
+        cloud: Path
+        """.npy [N, 3] or .ply: z up, the object's front towards -x, unit lengths"""
+        task: str
+        """how far to move the part: 30deg or 0.5rad (doors), 0.3 (drawers, unit lengths)"""
+        mask: Path | None = None
+        """.npy [N] bool: the points of the part to move"""
+        proposals: int = 100
+        seed: int = 0
+        out: Path | None = None
+        """.npz for the actionability of every point, all trajectories and their scores"""
+        json: _Json = False
+
+    args = tyro.cli(Predict, args=argv, prog="vatmart predict")
+    _enable_compilation_cache()
+    from vatmart_jax.inference import Priors, amount, read_cloud, read_mask
+
+    folder = args.priors / "priors" if (args.priors / "priors").is_dir() else args.priors
+    priors = Priors.load(folder)
+    points = read_cloud(args.cloud)
+    mask = None if args.mask is None else read_mask(args.mask, len(points))
+    if args.proposals < 1:
+        raise UserError(f"--proposals {args.proposals}: must be at least 1")
+    import jax
+
+    key, task = jax.random.key(args.seed), amount(args.task, priors.config.task)
+    found = priors.predict(points, task, mask, key, args.proposals)
+    if args.out is not None:
+        found.save(args.out)
+    result = {
+        "contact": found.contact.tolist(),
+        "contact_index": found.contact_index,
+        "actionability_max": float(found.actionability[found.contact_index]),
+        "trajectories": found.trajectories.tolist(),
+        "scores": found.scores.tolist(),
+    }
+    table = (
+        f"contact {', '.join(f'{x:.3f}' for x in found.contact)}  actionability {result['actionability_max']:.3f}  "
+        f"best score {found.scores[0]:.3f}"
+    )
+    _print_result(result, args.json, "" if args.json else table)
+
+
+def _export(argv: list[str]) -> None:
+    """Write a run's priors so that they stand alone: Flax, StableHLO."""
+
+    @dataclass(frozen=True)
+    class Export:
+        """Write the priors of a run into a folder that needs nothing else."""
+
+        run: Positional[Path]
+        """run folder of `vatmart train`, or a folder of priors"""
+        out: Path
+        format: str = "flax,stablehlo"
+        """flax (loads with Priors.load), stablehlo (loads with jax.export.deserialize), or both"""
+        proposals: int = 100
+        """trajectories that the StableHLO function returns"""
+        json: _Json = False
+
+    args = tyro.cli(Export, args=argv, prog="vatmart export")
+    from vatmart_jax.export import export
+    from vatmart_jax.inference import Priors
+
+    folder = args.run / "priors" if (args.run / "priors").is_dir() else args.run
+    files = export(Priors.load(folder), args.out, tuple(args.format.split(",")), args.proposals)
+    _print_result({"files": [str(f) for f in files]}, args.json)
+
+
 COMMANDS: dict[str, Callable[[list[str]], None]] = {
     "convert": _convert,
     "generate": _generate,
     "train": _train,
     "evaluate": _evaluate,
+    "predict": _predict,
+    "export": _export,
     "play": _play,
     "bench": _bench,
 }
@@ -360,15 +440,16 @@ def _peek(argv: list[str], flag: str) -> str | None:
     return None
 
 
-def _prepared(data: Path | None, say: Callable[[str], None]) -> Path:
-    """The converted folder of `data`, or of the bundled objects."""
+def _prepared(data: Path | None, say: Callable[[str], None], points: int = 0) -> Path:
+    """The converted folder of `data`, or of the bundled objects; views made now have at least so many points."""
     from conversion.convert import ConvertConfig, convert
     from mjcf_assets.generator import generate
     from vatmart_jax.data import BUNDLED_COUNT, BUNDLED_SEED, prepare
 
     def convert_into(source: Path, out: Path) -> None:
         say(f"converting {source} (what is up to date stays)")
-        for failure in convert([source], out, ConvertConfig()).failed:
+        config = ConvertConfig(points=max(points, ConvertConfig.points))
+        for failure in convert([source], out, config).failed:
             say(f"refused {failure['id']}: {failure['reason']}")
 
     def make(out: Path) -> None:

@@ -20,6 +20,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+import trimesh
 from flax import serialization
 
 from vatmart_jax.config import from_json, to_json
@@ -55,6 +56,17 @@ class Prediction(NamedTuple):
     actionability: np.ndarray  # [N] float32 in [0, 1]
     trajectories: np.ndarray  # [P, 30] float32 from that contact, best first; see geometry.pack_trajectory
     scores: np.ndarray  # [P] float32 in [0, 1], falling
+
+    def save(self, path: Path | str) -> None:
+        """Write one .npz file with these fields, complete or not at all."""
+        path = Path(path)
+        part = path.with_name(path.name + ".part")
+        try:
+            with part.open("wb") as f:
+                np.savez(f, **self._asdict())
+            part.replace(path)
+        finally:
+            part.unlink(missing_ok=True)
 
 
 @dataclass(frozen=True)
@@ -161,6 +173,59 @@ def predict(
     scores = jax.nn.sigmoid(networks.score(params, at, points[contact], task, trajectories))
     best = jnp.argsort(-scores)
     return contact, actionability, trajectories[best], scores[best]
+
+
+def read_cloud(path: Path) -> np.ndarray:
+    """Points [N, 3] float32 of a .npy or .ply file. Raises PriorsError where it holds none."""
+    try:
+        if path.suffix.lower() == ".npy":
+            points = np.load(path, allow_pickle=False)
+        elif path.suffix.lower() == ".ply":
+            points = np.asarray(trimesh.load(path, process=False).vertices)
+        else:
+            raise PriorsError(f"{path}: expected a .npy or .ply file")
+    except PriorsError:
+        raise
+    except FileNotFoundError:
+        raise PriorsError(f"{path}: no such file") from None
+    except Exception as e:  # whatever the readers raise on damaged bytes
+        raise PriorsError(f"{path}: cannot be read ({_first_line(e)})") from e
+    if points.dtype.kind not in "fiu" or points.ndim != 2 or points.shape[1] != 3 or not len(points):
+        raise PriorsError(f"{path}: expected numbers [N, 3], found {points.dtype} {points.shape}")
+    points = points.astype(np.float32)
+    if not np.isfinite(points).all():
+        raise PriorsError(f"{path}: holds coordinates that are not finite; remove those points")
+    return points
+
+
+def read_mask(path: Path, count: int) -> np.ndarray:
+    """[count] bool of a .npy file. Raises PriorsError where it holds something else."""
+    try:
+        mask = np.load(path, allow_pickle=False)
+    except (OSError, EOFError, ValueError) as e:
+        raise PriorsError(f"{path}: cannot be read ({_first_line(e)}); expected a .npy file of booleans") from e
+    if mask.shape != (count,) or mask.dtype.kind not in "bui" or not mask.any():
+        raise PriorsError(
+            f"{path}: expected {count} booleans, one of them true at least; found {mask.dtype} {mask.shape}"
+        )
+    return mask.astype(bool)
+
+
+def amount(text: str, task: str) -> float:
+    """Rad or unit lengths from `30deg`, `0.5rad` or a plain number of the task's unit. Raises PriorsError."""
+    door = task.endswith("door")
+    number, unit = text, ""
+    for suffix in ("deg", "rad"):
+        if text.endswith(suffix):
+            number, unit = text[: -len(suffix)], suffix
+    try:
+        value = float(number)
+    except ValueError:
+        value = math.nan
+    if not (math.isfinite(value) and value > 0) or (unit and not door):
+        example = "30deg or 0.5rad" if door else "0.3 (unit lengths)"
+        raise PriorsError(f"--task {text}: expected an amount above 0 such as {example}, for the priors are of {task}")
+    return math.radians(value) if unit == "deg" else value
 
 
 def _read_config(path: Path) -> PriorsConfig:

@@ -18,6 +18,7 @@ import optax
 from flax import struct
 
 from vatmart_jax.bank import ViewBank
+from vatmart_jax.errors import UserError
 from vatmart_jax.geometry import WAYPOINTS
 from vatmart_jax.perception import losses
 from vatmart_jax.perception.networks import Features, Networks, NetworksConfig, Params
@@ -186,12 +187,12 @@ def clouds_of(
 ) -> Clouds:
     """The first n_points of every view, grouped; `on_progress(done, total)` counts views.
 
-    Raises ValueError where the bank's views have fewer points.
+    Raises UserError where the bank's views have fewer points.
     """
     if bank.points.shape[1] < config.n_points:
-        raise ValueError(
-            f"the views have {bank.points.shape[1]} points, the networks want {config.n_points}; "
-            "convert again with more points or choose smaller networks"
+        raise UserError(
+            f"the views have {bank.points.shape[1]} points, the networks want {config.n_points}; convert again with "
+            f"--points {config.n_points}, or choose another preset"
         )
     points = bank.points[:, : config.n_points]
     total, size, parts = len(bank), 16, []

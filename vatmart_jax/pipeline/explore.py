@@ -11,6 +11,7 @@ from flax import struct
 
 from vatmart_jax import geometry as g
 from vatmart_jax.env import ACTION, OBSERVATION, Env, EnvState, Start, reward_terms
+from vatmart_jax.errors import UserError
 from vatmart_jax.expert import expert_action
 from vatmart_jax.rl.replay import Episode, Replay, hindsight
 from vatmart_jax.rl.td3 import TD3, TD3Config, TD3State
@@ -128,7 +129,7 @@ class Explorer:
 def start_pool(explorer: Explorer, key: jax.Array, size: int, progress=lambda done: None) -> Start:
     """`size` starts that are free and, when pulling, grasp. Consumes the key.
 
-    Raises ValueError where fewer than one in two hundred random starts will do: the data does not fit the task.
+    Raises UserError where fewer than one in two hundred random starts will do: the data does not fit the task.
     """
     kept: list[Start] = []
     found = tried = 0
@@ -141,7 +142,7 @@ def start_pool(explorer: Explorer, key: jax.Array, size: int, progress=lambda do
         tried += len(state.valid)
         progress(min(found, size))
         if tried >= 20 * explorer.env.config.batch and found < tried / 200:
-            raise ValueError(
+            raise UserError(
                 f"only {found} of {tried} random starts of task {explorer.env.task.name} are free and hold: "
                 "the objects do not fit the gripper; look at the conversion's report"
             )

@@ -14,6 +14,7 @@ import numpy as np
 from flax import struct
 
 from vatmart_jax.env import Env, Start, Task
+from vatmart_jax.errors import UserError
 from vatmart_jax.perception import train as perception
 from vatmart_jax.perception.networks import Networks
 from vatmart_jax.perception.train import Clouds, PerceptionConfig, PerceptionState, Samples
@@ -54,6 +55,11 @@ class Training:
         self._clouds: Clouds | None = None
         self._score = partial(perception.score_trajectories, self.networks)
         self._begun = time.monotonic()
+        wanted, found = self.config.networks.pointnet.n_points, env.views.points.shape[1]
+        if found < wanted:  # said before hours of exploration
+            raise UserError(
+                f"the views have {found} points, the networks want {wanted}; convert with --points {wanted}"
+            )
 
     def key(self, purpose: str, index: int | jax.Array = 0) -> jax.Array:
         """A key for one use, the same whenever the run is resumed."""
