@@ -16,7 +16,7 @@ import sys
 import time
 import traceback
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import asdict, dataclass, fields
 from importlib.metadata import version
 from multiprocessing.connection import Connection, wait
 from pathlib import Path
@@ -29,9 +29,9 @@ from conversion import partnet
 from conversion.boxes import boxes
 from conversion.budget import joined, within_budget
 from conversion.decompose import DecomposeConfig, Surface, decompose, fidelity
-from conversion.handles import Handle, handles
+from conversion.handles import shapes
 from conversion.mjcf import MjcfConfig, to_mjcf
-from conversion.partnet import ConvertedObject, Hull, ObjectError, Part, PartNetObject
+from conversion.partnet import ConvertedObject, ObjectError
 from conversion.report import contact_sheet, page, picture, read_png, save_png
 from conversion.scenes import scene_bank
 from conversion.views import views
@@ -152,7 +152,7 @@ def _key(folder: Path, config: ConvertConfig, split: str | None) -> str:
     others = {f.name for f in fields(ViewConfig)} | {"time_limit"}
     settings = {name: value for name, value in asdict(config).items() if name not in others}
     digest = hashlib.sha256(json.dumps([settings, split, _versions()], sort_keys=True).encode())
-    for function in (partnet.read_object, decompose, boxes, to_mjcf, scene_bank, within_budget, handles):
+    for function in (partnet.read_object, decompose, boxes, to_mjcf, scene_bank, within_budget, shapes):
         digest.update(inspect.getsource(sys.modules[function.__module__]).encode())
     for path in sorted(folder.rglob("*")):
         if path.suffix.lower() in _SOURCE_SUFFIXES and path.is_file():
@@ -200,7 +200,7 @@ def _convert_one(folder: Path, out: Path, config: ConvertConfig, split: str | No
         if visuals := obj.group_visuals(root):
             surface = Surface(visuals, config.seed)
             part = next((p for p in parts if p.link == root), None)
-            hulls[root], passable = _shapes(obj, part, surface, budget, config)
+            hulls[root], passable = shapes(obj, part, surface, budget, config.collision, config)
             found += passable
             groups[root] = {"hulls": len(hulls[root]), "budget": budget, **asdict(fidelity(surface, hulls[root]))}
     split = split or default_split(obj.category, obj.id)
@@ -239,30 +239,6 @@ def _convert_one(folder: Path, out: Path, config: ConvertConfig, split: str | No
         part.rename(out / obj.id)
     finally:
         shutil.rmtree(part, ignore_errors=True)
-
-
-def _shapes(
-    obj: PartNetObject, part: Part | None, surface: Surface, budget: int, config: ConvertConfig
-) -> tuple[list[Hull], list[Handle]]:
-    """Collision geometry of one group; finer where a finger would no longer pass behind a handle of a part."""
-    best: tuple[list[Hull], list[Handle]] | None = None
-    for share in (1, 2, 4):
-        finer = replace(
-            config,
-            handle_tolerance=config.handle_tolerance / share,
-            handle_merge_tolerance=config.handle_merge_tolerance / share,
-        )
-        hulls = decompose(surface, budget, finer)
-        if config.collision == "box":
-            hulls = boxes(surface, hulls, 2 * budget, finer)
-        found = handles(obj, part, hulls) if part else []
-        lost = lambda found: sum(h.visual and not h.hulls for h in found)  # noqa: E731
-        if best is None or lost(found) < lost(best[1]):
-            best = hulls, found
-        if not lost(found):
-            break
-    assert best is not None
-    return best
 
 
 def _banks(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import trimesh
@@ -11,10 +11,13 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import ConvexHull
 from trimesh.ray.ray_pyembree import RayMeshIntersector
 
+from conversion.boxes import boxes
+from conversion.decompose import DecomposeConfig, Surface, decompose
 from conversion.partnet import Hull, Part, PartNetObject, Visual
 
 FINGER = 0.012  # thickness and width of the finger that must pass, unit lengths
 SPACING = 0.003  # of the rays
+FINER = 1, 3, 8  # shares of the handles' tolerances that are tried in turn
 
 
 @dataclass(frozen=True)
@@ -23,6 +26,33 @@ class Handle:
     name: str  # of its first visual
     visual: bool  # a finger passes behind it in the visual mesh
     hulls: bool  # and behind its hulls
+
+
+def shapes(
+    obj: PartNetObject, part: Part | None, surface: Surface, budget: int, collision: str, config: DecomposeConfig
+) -> tuple[list[Hull], list[Handle]]:
+    """Collision geometry ("hull" or "box") of one group, and the handles on it where it is a part's.
+
+    Handles through which a finger would no longer pass are made finer, and what is beside them too.
+    """
+    best: tuple[list[Hull], list[Handle]] = [], []
+    fewest = np.inf
+    for finer in FINER:
+        fine = replace(
+            config,
+            handle_tolerance=config.handle_tolerance / finer,
+            handle_merge_tolerance=config.handle_merge_tolerance / finer,
+        )
+        hulls = decompose(surface, budget, fine)
+        if collision == "box":
+            hulls = boxes(surface, hulls, 2 * budget, fine)
+        found = handles(obj, part, hulls) if part else []
+        lost = sum(h.visual and not h.hulls for h in found)
+        if lost < fewest:
+            best, fewest = (hulls, found), lost
+        if not lost:
+            break
+    return best
 
 
 def handles(obj: PartNetObject, part: Part, hulls: Sequence[Hull]) -> list[Handle]:
