@@ -377,6 +377,8 @@ def _joint(reader: _Reader, urdf: str, j: yourdfpy.Joint) -> Joint:
         return Joint(j.name, "fixed", j.parent, j.child, origin, np.array([1.0, 0, 0]), 0.0, 0.0)
     if not 1e-6 < norm < np.inf:
         raise reader.error(f"{where} has axis {axis}; expected three finite numbers, not all 0", urdf)
+    if j.type == "prismatic" and abs(norm - 1) > 1e-3:
+        reader.notes.append(f"{where}: axis of length {norm:.3g}, taken as a direction; its values are unit lengths")
     axis = axis / norm
     lower, upper = -np.inf, np.inf
     if j.type != "continuous":

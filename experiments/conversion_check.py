@@ -98,7 +98,10 @@ def _crash(reason: str) -> bool:
 
 
 def kinematics(check: Check, configurations: int = 100) -> dict[str, Any]:
-    """2: poses of every link in MuJoCo and by yourdfpy, at random joint values."""
+    """2: poses of every link in MuJoCo and by yourdfpy, at random joint values.
+
+    yourdfpy multiplies a slide's value by its axis as written; MuJoCo (as SAPIEN) takes the axis as a direction.
+    """
     rng = np.random.default_rng(check.seed)
     worst: dict[str, float] = {}
     links = 0
@@ -107,6 +110,9 @@ def kinematics(check: Check, configurations: int = 100) -> dict[str, Any]:
         data = mujoco.MjData(model)
         urdf = next(p for n in URDF_NAMES if (p := check.src / r["id"] / n).is_file())
         oracle = yourdfpy.URDF.load(str(urdf), load_meshes=False)
+        for j in oracle.robot.joints:
+            if j.type != "fixed" and j.axis is not None:
+                j.axis = j.axis / np.linalg.norm(j.axis)
         names = {model.joint(i).name for i in range(model.njnt)}
         joints = [j for j in oracle.robot.joints if j.name in oracle.actuated_joint_names]
         links += len(oracle.robot.links)
