@@ -297,7 +297,7 @@ def _timed(call: Callable[[int], Any], seconds: float) -> _Timing:
         result = jax.block_until_ready(call(calls))
         elapsed = time.perf_counter() - begun
         if calls >= 2 and elapsed >= seconds:
-            return _Timing(result, elapsed / calls, first - elapsed / calls)
+            return _Timing(result, elapsed / calls, max(0.0, first - elapsed / calls))
 
 
 def _press(env: Env, state: EnvState, advances: jax.Array) -> EnvState:

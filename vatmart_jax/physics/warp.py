@@ -30,7 +30,7 @@ wp.config.log_level = max(wp.config.log_level, wp.LOG_ERROR)  # it logs to stand
 _FIELDS = tuple(f for f in SCENE_FIELDS if f not in ("geom_sameframe", "body_sameframe", "body_simple", "dof_M0"))
 
 # Room for contacts per world, shared by all, and for constraint rows of each world (docs/physics.md).
-_CONTACTS, _ROWS = 64, 256
+_CONTACTS, _CONTACTS_AT_LEAST, _ROWS = 64, 1024, 256
 _LOST = mjw.OverflowType.NEFC | mjw.OverflowType.BROADPHASE | mjw.OverflowType.NARROWPHASE | mjw.OverflowType.CCD
 
 
@@ -47,7 +47,7 @@ class WarpPhysics:
         self._worlds: dict[int, _Worlds] = {}  # by number of simulations
         self._device = wp.device_from_jax(jnp.zeros(()).device)
         mode = wp.JaxCallableGraphMode.WARP_STAGED if self._device.is_cuda else wp.JaxCallableGraphMode.NONE
-        self._contact_call = wp.jax_callable(_contact, graph_mode=mode)
+        self._contact_call = wp.jax_callable(_contact, num_outputs=2, graph_mode=mode)
         self._step_call = wp.jax_callable(_step, num_outputs=5, graph_mode=mode)
         self._contact = _flat_vmap(self._contact)
         self._step = _flat_vmap(self._step)
@@ -55,8 +55,9 @@ class WarpPhysics:
     def reset(self, scene: jax.Array, gripper_pose: jax.Array, qpos: jax.Array) -> PhysicsState:
         scene, pose, qpos = jnp.asarray(scene, jnp.int32), *(jnp.asarray(x, jnp.float32) for x in (gripper_pose, qpos))
         finite = jnp.isfinite(qpos).all(-1) & jnp.isfinite(pose).all(-1)
+        contact, sound = self._contact(scene, pose, qpos, finite)
         rest = jnp.zeros_like(qpos)
-        return PhysicsState(scene, pose, qpos, rest, self._contact(scene, pose, qpos, finite), ~finite, _bits(rest))
+        return PhysicsState(scene, pose, qpos, rest, contact, ~sound, _bits(rest))
 
     def rollout(self, state: PhysicsState, ctrl: jax.Array, active: jax.Array) -> PhysicsState:
         ctrl = jnp.asarray(ctrl, jnp.float32)
@@ -76,8 +77,7 @@ class WarpPhysics:
         )
 
     def _contact(self, scene, *rest):
-        (contact,) = self._contact_call(self._handle(len(scene)), scene, *rest)
-        return contact
+        return tuple(self._contact_call(self._handle(len(scene)), scene, *rest))
 
     def _step(self, scene, *rest):
         n = len(scene)
@@ -103,7 +103,7 @@ class _Worlds:
         with wp.ScopedDevice(device):
             self.model = mjw.put_model(model, batch_sizes=dict.fromkeys(_FIELDS, n))
             self.model.opt.warn_overflow = 0  # what is lost counts as divergence instead
-            self.data = mjw.make_data(model, n, nconmax=_CONTACTS, njmax=_ROWS)
+            self.data = mjw.make_data(model, n, naconmax=max(_CONTACTS * n, _CONTACTS_AT_LEAST), njmax=_ROWS)
             self.alive = wp.zeros(n, dtype=bool)
             for name in _FIELDS:
                 rows = getattr(self.model, name)
@@ -115,15 +115,22 @@ class _Worlds:
         _WORLDS[self.handle] = self
 
     def load(self, scene, pose, qpos, active) -> None:
+        """Simulations at rest."""
         data = self.data
         for values, rows in self._fields:
             wp.launch(_gather, rows.shape, [values, scene], [rows])
-        wp.launch(_place, data.nworld, [pose, qpos, active], [data.mocap_pos, data.mocap_quat, data.qpos, self.alive])
+        placed = [data.mocap_pos, data.mocap_quat, data.qpos, self.alive]
+        wp.launch(_place, data.nworld, [pose, qpos, active], placed)
+        for value in (data.qvel, data.qacc_warmstart, data.overflow):
+            value.zero_()
 
-    def flag_contacts(self, contact_out) -> None:
+    def report(self, contact_out, sound_out) -> None:
+        """Who touches the object, and whose numbers are good."""
+        data = self.data
         contact_out.zero_()
-        contact = self.data.contact
-        wp.launch(_flag_contacts, self.data.naconmax, [self.data.nacon, contact.worldid], [contact_out])
+        wp.launch(_flag_contacts, data.naconmax, [data.nacon, data.contact.worldid], [contact_out])
+        counts = [data.nacon, data.ncollision, data.naconmax, data.overflow]
+        wp.launch(_judge, data.nworld, [data.qpos, data.qvel, data.qacc_warmstart, self.alive, *counts], [sound_out])
 
 
 # A call carries the number of its worlds as a constant.
@@ -138,12 +145,13 @@ def _contact(
     qpos: wp.array2d[float],
     active: wp.array[bool],
     contact_out: wp.array[bool],
+    sound_out: wp.array[bool],
 ) -> None:
     worlds = _WORLDS[handle]
     worlds.load(scene, pose, qpos, active)
     mjw.kinematics(worlds.model, worlds.data)
     mjw.collision(worlds.model, worlds.data)
-    worlds.flag_contacts(contact_out)
+    worlds.report(contact_out, sound_out)
 
 
 def _step(
@@ -166,14 +174,12 @@ def _step(
     worlds.load(scene, pose, qpos, active)
     wp.copy(data.qvel, qvel)
     wp.copy(data.qacc_warmstart, warmstart)
-    data.overflow.zero_()
     for step in range(ctrl.shape[1]):
         wp.launch(_begin_step, data.nworld, [step, ctrl], [data.ctrl, worlds.alive, *state, data.mocap_pos])
         mjw.step(worlds.model, data)
-    wp.launch(_end, data.nworld, [*state, worlds.alive, data.overflow], [sound_out])
     for out, value in zip((qpos_out, qvel_out, warmstart_out), state, strict=True):
         wp.copy(out, value)
-    worlds.flag_contacts(contact_out)
+    worlds.report(contact_out, sound_out)
 
 
 @wp.kernel
@@ -256,16 +262,20 @@ def _begin_step(
 
 
 @wp.kernel
-def _end(
+def _judge(
     qpos: wp.array2d[float],
     qvel: wp.array2d[float],
     qacc: wp.array2d[float],
     alive: wp.array[bool],
+    contacts: wp.array[int],
+    pairs: wp.array[int],
+    capacity: int,
     overflow: wp.array[int],
     sound_out: wp.array[bool],
 ):
     world = wp.tid()
-    lost = (overflow[world] & wp.static(int(_LOST))) != 0
+    # A full contact buffer does not tell whose contacts it lacks.
+    lost = contacts[0] > capacity or pairs[0] > capacity or (overflow[world] & wp.static(int(_LOST))) != 0
     sound_out[world] = alive[world] and not lost and _sound(qpos, qvel, qacc, world)
 
 
