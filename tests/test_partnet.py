@@ -187,6 +187,13 @@ def test_limits_that_are_swapped_infinite_or_empty_are_made_sense_of(cupboard):
     assert moved.origin[:3, 3] == pytest.approx([-0.3, 0, 0])
 
 
+def test_the_axis_of_a_slide_is_a_direction_and_another_length_is_noted(cupboard):
+    edit(cupboard, '<axis xyz="-1 0 0"/>', '<axis xyz="-0.1 0 0"/>')
+    obj = read_object(cupboard)
+    assert obj.joints["link_1"].axis == pytest.approx([-1, 0, 0])
+    assert any("axis of length 0.1, taken as a direction" in note for note in obj.notes)
+
+
 @pytest.mark.parametrize(
     ("old", "new", "semantics", "reason"),
     [
