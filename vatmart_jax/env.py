@@ -248,11 +248,12 @@ class Env:
         tip = zero
         held = ~in_collision
         if pulling:
-            tip = (config.standoff + config.grasp_depth) * up
-            for opening in (FINGER_OPEN, 0.0):  # advance, then close
-                physics, ctrl = self._drive(
-                    physics, ctrl, tip, zero, start.rotation, jnp.full((n,), opening), ~in_collision
-                )
+            free = ~in_collision
+            advanced = (config.standoff + config.grasp_depth) * up
+            physics, ctrl = self._drive(physics, ctrl, advanced, zero, start.rotation, fingers, free)
+            # Close where the hand got to: pressed against a panel, fingers would stick to it and seem to hold it.
+            tip = self._tip(physics, start.rotation) - (point - config.standoff * up)
+            physics, ctrl = self._drive(physics, ctrl, tip, zero, start.rotation, jnp.zeros((n,)), free)
             held = ~in_collision & self._holds(physics)
         valid = ~in_collision & held & ~physics.diverged
         nothing = jnp.zeros((n,))
@@ -402,9 +403,12 @@ class Env:
 
     def tip(self, state: EnvState) -> jax.Array:
         """[B, 3] the point between the fingertips, object frame."""
-        hand_q, start = state.physics.qpos[:, HAND], state.start.rotation
+        return self._tip(state.physics, state.start.rotation)
+
+    def _tip(self, physics: PhysicsState, start: jax.Array) -> jax.Array:
+        hand_q = physics.qpos[:, HAND]
         now = start @ g.matrix_from_euler(hand_q[:, 3:])
-        return state.physics.gripper_pose[:, :3] + g.rotate(start, hand_q[:, :3]) + TIP * now[:, :, 2]
+        return physics.gripper_pose[:, :3] + g.rotate(start, hand_q[:, :3]) + TIP * now[:, :, 2]
 
     def _observe(self, state: EnvState) -> tuple[jax.Array, jax.Array]:
         """The paper's 33 numbers in the joint-local frame [B, 33], and the fingertips' distance to the contact [B]."""
