@@ -17,6 +17,7 @@ import time
 import traceback
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass, fields
+from functools import cache
 from importlib.metadata import version
 from multiprocessing.connection import Connection, wait
 from pathlib import Path
@@ -152,8 +153,7 @@ def _key(folder: Path, config: ConvertConfig, split: str | None) -> str:
     others = {f.name for f in fields(ViewConfig)} | {"time_limit"}
     settings = {name: value for name, value in asdict(config).items() if name not in others}
     digest = hashlib.sha256(json.dumps([settings, split, _versions()], sort_keys=True).encode())
-    for function in (partnet.read_object, decompose, boxes, to_mjcf, scene_bank, within_budget, shapes):
-        digest.update(inspect.getsource(sys.modules[function.__module__]).encode())
+    digest.update(_source())
     for path in sorted(folder.rglob("*")):
         if path.suffix.lower() in _SOURCE_SUFFIXES and path.is_file():
             digest.update(str(path.relative_to(folder)).encode())
@@ -163,6 +163,14 @@ def _key(folder: Path, config: ConvertConfig, split: str | None) -> str:
     return digest.hexdigest()[:32]
 
 
+@cache
+def _source() -> bytes:
+    """Of the modules that an object's conversion runs."""
+    functions = (partnet.read_object, decompose, boxes, to_mjcf, scene_bank, within_budget, shapes)
+    return "".join(inspect.getsource(sys.modules[f.__module__]) for f in functions).encode()
+
+
+@cache
 def _versions() -> dict[str, str]:
     return {name: version(name) for name in ("vatmart-jax", "numpy", "scipy", "trimesh", "coacd", "mujoco")}
 
