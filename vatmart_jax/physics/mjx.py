@@ -17,9 +17,10 @@ from vatmart_jax.physics.interface import PhysicsState
 from vatmart_jax.physics.template import PhysicsConfig, Template, scene_model, template
 
 # MJX tests every pair of geoms that it is given, near or not. So each of the gripper's three boxes gets its own nearest
-# slots, chosen anew every few steps: this many of the static object and of the part.
+# slots, chosen anew every few steps: this many of the static object and of the part. For hulls, fewer: each slot is a
+# kernel of its own to compile.
 BOXES = ("hand", "left_finger", "right_finger")
-NEAR = (2, 3)
+NEAR = {"box": (2, 3), "hull": (1, 2)}
 RENEW = 4
 # Its Newton solver runs for the slowest of the batch, and its line search always to the end.
 ITERATIONS, LS_ITERATIONS = 5, 5
@@ -51,7 +52,7 @@ class MjxPhysics:
         self.config = config
         full = template(bank, config)
         static, part = (np.flatnonzero(full.model.geom_bodyid == full.model.body(b).id) for b in ("object", "part"))
-        self._near = [min(n, len(slots)) for n, slots in zip(NEAR, (static, part), strict=True)]
+        self._near = [min(n, len(slots)) for n, slots in zip(NEAR[bank.collision], (static, part), strict=True)]
         counts = [len(BOXES) * n for n in self._near]
         model = scene_model(bank, 0, config, (counts[0], counts[1]))
         model.opt.iterations, model.opt.ls_iterations = ITERATIONS, LS_ITERATIONS
