@@ -100,7 +100,7 @@ def _crash(reason: str) -> bool:
 def kinematics(check: Check, configurations: int = 100) -> dict[str, Any]:
     """2: poses of every link in MuJoCo and by yourdfpy, at random joint values.
 
-    yourdfpy multiplies a slide's value by its axis as written; MuJoCo (as SAPIEN) takes the axis as a direction.
+    yourdfpy multiplies a slide's value by its axis as written; MuJoCo takes the axis as a direction.
     """
     rng = np.random.default_rng(check.seed)
     worst: dict[str, float] = {}
