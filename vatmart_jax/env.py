@@ -28,6 +28,7 @@ from vatmart_jax.physics.controller import hand_target, waypoint_controls
 from vatmart_jax.physics.template import FINGER_OPEN, FINGERS, HAND, PART, TIP
 
 OBSERVATION, ACTION = 33, 6
+_FIT_DEPTH, _FIT_BATCH = 0.02, 1024  # unit lengths past the contact; poses tested at once
 _HANDLE_POINTS, _HAND_REACH = 200, 0.05  # per shape of a handle; unit lengths about the contact
 MIN_PUSHABLE = 4  # of a view's contacts; with fewer, it hardly shows where to push
 
@@ -145,8 +146,8 @@ class Env:
         physics: PhysicsConfig | None = None,
     ):
         """Keeps the Scenes of the task's joint type, and the views that leave room for the task and show where to do
-        it: a door seen from the inside alone cannot be pushed shut. (The released code goes further: its trials are
-        ones that a policy has solved from that view.)
+        it: a door seen from the inside alone cannot be pushed shut, one that is flush and has no handle cannot be
+        pulled. (The released code goes further: its trials are ones that a policy has solved from that view.)
 
         Raises UserError where nothing is left.
         """
@@ -161,23 +162,49 @@ class Env:
         room = bank.width[views.scene] - views.q if task.opening else views.q
         views = views.select((views.opening == task.opening) & (room >= task.low))
         promising = promising_contacts(bank, views, task)
-        shown = promising.sum(1) >= (1 if task.opening else MIN_PUSHABLE)
-        views, promising = views.select(shown), promising[shown]
-        if len(views) == 0:
-            raise UserError(
-                f"the data has no view of a {kind} that can be moved by task {task.name}; convert with more --views"
-            )
-        self.task, self.config = task, config or EnvConfig()
-        self.bank, self.views = bank, views
+        nothing = UserError(
+            f"the data has no view of a {kind} that can be moved by task {task.name}; convert with more --views"
+        )
+        if not promising.any():
+            raise nothing
+        self.task, self.config, self.bank = task, config or EnvConfig(), bank
         self.physics = make_physics(bank, impl, physics)
         self._scenes = Scenes.of(bank)
+        self._show(views, promising)
+        if task.opening:
+            promising &= self._fit(promising)
+            handle = promising & views.contact_handle
+            promising = np.where(handle.any(1, keepdims=True), handle, promising)
+        shown = promising.sum(1) >= (1 if task.opening else MIN_PUSHABLE)
+        if not shown.any():
+            raise nothing
+        self._show(views.select(shown), promising[shown])
+
+    def _show(self, views: ViewBank, promising: np.ndarray) -> None:
+        """Trials begin at these views from now on."""
+        bank, self.views = self.bank, views
         self._view_scene = jnp.asarray(views.scene)
         self._view_q = jnp.asarray(views.q)
         self._view_cdf = jnp.asarray(np.cumsum(_balanced(bank, views)), jnp.float32)
         self._contacts = jnp.asarray(views.contacts)
         self._normals = jnp.asarray(views.contact_normals)
         self._promising = jnp.asarray(promising)
-        self._grasps = tuple(map(jnp.asarray, grasps(bank, views))) if task.opening else None
+        self._grasps = tuple(map(jnp.asarray, grasps(bank, views))) if self.task.opening else None
+
+    def _fit(self, chosen: np.ndarray) -> np.ndarray:
+        """[V, C] bool, of the chosen ones: the open hand is free before the straight grasp and when it has advanced."""
+        up, across = (np.asarray(x) for x in self._grasps or ())
+        rows = np.argwhere(chosen)
+        found = np.zeros_like(chosen)
+        free = jax.jit(lambda start: self.is_free(start) & self.is_free(start, _FIT_DEPTH))
+        for first in range(0, len(rows), _FIT_BATCH):
+            # The last batch is filled up with the last row: one shape, one compilation.
+            view, contact = rows[np.minimum(np.arange(first, first + _FIT_BATCH), len(rows) - 1)].T
+            y, z = across[view, contact], up[view, contact]
+            rotation = np.stack([np.cross(y, z), y, z], -1)
+            start = Start(jnp.asarray(view), jnp.asarray(contact), jnp.zeros(_FIT_BATCH), jnp.asarray(rotation))
+            found[view, contact] = free(start)
+        return found
 
     def sample(self, key: jax.Array, n: int) -> Start:
         """n random starts: category uniform, then object, Scene, view; task; contact; approach; roll.
@@ -237,7 +264,7 @@ class Env:
     def begin(self, start: Start) -> EnvState:
         """Put the hand at its start poses and, when pulling, grasp."""
         config, pulling = self.config, self.task.opening
-        physics = self._placed(start)
+        physics = self._placed(start, -config.standoff)
         scene, n = physics.scene, len(start.view)
         q0, point = self._view_q[start.view], self._contacts[start.view, start.contact]
         up = start.rotation[:, :, 2]
@@ -282,9 +309,9 @@ class Env:
         obs, distance = self._observe(state)
         return state.replace(obs=obs, info={**state.info, "tip_distance": distance})
 
-    def is_free(self, start: Start) -> jax.Array:
-        """[B] bool, the start poses touch nothing."""
-        physics = self._placed(start)
+    def is_free(self, start: Start, depth: float | None = None) -> jax.Array:
+        """[B] bool, the start poses touch nothing; or those with the fingertips `depth` past the contact points."""
+        physics = self._placed(start, -self.config.standoff if depth is None else depth)
         return ~(physics.in_contact | physics.diverged)
 
     def step(self, state: EnvState, action: jax.Array, abandon: bool = True) -> EnvState:
@@ -317,11 +344,11 @@ class Env:
 
         return jax.lax.scan(waypoint, self.begin(start), residuals.swapaxes(0, 1))[0]
 
-    def _placed(self, start: Start) -> PhysicsState:
-        """The hand at its start poses, closed to push and open to pull."""
+    def _placed(self, start: Start, depth: float) -> PhysicsState:
+        """The hand with its tips `depth` past the contacts, closed to push and open to pull."""
         scene, q0 = self._view_scene[start.view], self._view_q[start.view]
         point = self._contacts[start.view, start.contact]
-        hand = point - (TIP + self.config.standoff) * start.rotation[:, :, 2]
+        hand = point + (depth - TIP) * start.rotation[:, :, 2]
         n = len(scene)
         fingers = jnp.full((n, 2), FINGER_OPEN if self.task.opening else 0.0)
         qpos = jnp.concatenate([q0[:, None], jnp.zeros((n, 6)), fingers], -1)
@@ -459,15 +486,14 @@ def reward_terms(task, before, after, distance, success) -> dict[str, jax.Array]
 def promising_contacts(bank: SceneBank, views: ViewBank, task: Task) -> np.ndarray:
     """[V, C] bool: where the task may be done.
 
-    Push: faces that look against the part's motion, off its axis. Pull: the handle, where the view shows one; else
-    faces along the motion and off the axis, which two fingers may straddle.
+    Push: faces that look against the part's motion, off its axis. Pull: handles, and faces along the motion and off the
+    axis, which two fingers may straddle; an environment keeps those where the hand fits, handles first.
     """
     motion, arm = _motion(bank, views)
     along = (views.contact_normals * motion).sum(-1)
     if not task.opening:
         return (along > 0.5) & (arm > 0.1)
-    shown = views.contact_handle.any(1, keepdims=True)
-    return np.where(shown, views.contact_handle, (np.abs(along) < 0.4) & (arm > 0.1))
+    return views.contact_handle | ((np.abs(along) < 0.4) & (arm > 0.1))
 
 
 def _motion(bank: SceneBank, views: ViewBank) -> tuple[np.ndarray, np.ndarray]:
