@@ -122,6 +122,7 @@ def _physics(choice: Choice, impl: str, batch: int, task: str, seed: int, second
         "compile_seconds": round(pressing.compile_seconds + whole.compile_seconds, 2),
         "seed": seed,
         "device": device(),
+        "load": round(os.getloadavg()[0], 1),
     }
 
 
@@ -184,6 +185,7 @@ def bench_parity(
         "split": choice.split,
         "seed": seed,
         "device": device(),
+        "load": round(os.getloadavg()[0], 1),
     }
 
 
@@ -228,6 +230,7 @@ def bench_perception(choice: Choice, preset: str, seed: int, seconds: float) -> 
         "peak_memory_mb": round(_peak_memory() / 2**20),
         "seed": seed,
         "device": device(),
+        "load": round(os.getloadavg()[0], 1),
     }
 
 
@@ -282,22 +285,19 @@ def _check(flag: str, names: Iterable[str], known: Iterable[str]) -> None:
 @dataclass(frozen=True)
 class _Timing:
     result: Any  # of the last call
-    seconds: float  # per call, in the mean
+    seconds: float  # per call, the median: others may use the machine
     compile_seconds: float  # what the first call took longer
 
 
 def _timed(call: Callable[[int], Any], seconds: float) -> _Timing:
     """Calls call(0), call(1), ... for at least `seconds` and two calls, after a first one that compiles."""
-    begun = time.perf_counter()
-    jax.block_until_ready(call(0))
-    first, calls = time.perf_counter() - begun, 0
-    begun = time.perf_counter()
-    while True:
-        calls += 1
-        result = jax.block_until_ready(call(calls))
-        elapsed = time.perf_counter() - begun
-        if calls >= 2 and elapsed >= seconds:
-            return _Timing(result, elapsed / calls, max(0.0, first - elapsed / calls))
+    times, result = [], None
+    while len(times) < 3 or sum(times[1:]) < seconds:
+        begun = time.perf_counter()
+        result = jax.block_until_ready(call(len(times)))
+        times.append(time.perf_counter() - begun)
+    per_call = float(np.median(times[1:]))
+    return _Timing(result, per_call, max(0.0, times[0] - per_call))
 
 
 def _press(env: Env, state: EnvState, advances: jax.Array) -> EnvState:
