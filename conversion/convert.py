@@ -112,6 +112,8 @@ def convert(sources: Sequence[Path], out: Path, config: ConvertConfig, jobs: int
             current[name] = key
         else:
             work.append(folder)
+    # The largest first, or one process works on it while the others have nothing left.
+    work.sort(key=lambda f: -sum(p.stat().st_size for p in f.rglob("*.obj") if p.is_file()))
     # Resolved, so that a folder given as `.` has a name.
     tasks = [(f.resolve(), out, config, splits.get(f.resolve().name), keys[f]) for f in work]
     for (folder, *_, key), error in _pool(_convert_one, tasks, jobs, config.time_limit):
