@@ -6,11 +6,13 @@ from pathlib import Path
 import jax
 import numpy as np
 import pytest
+import trimesh
 from flax import serialization
 from jax import export as jax_export
 
+from vatmart_jax.cli import main
 from vatmart_jax.export import ExportError, export
-from vatmart_jax.inference import Priors, PriorsConfig, PriorsError
+from vatmart_jax.inference import Priors, PriorsConfig, PriorsError, amount, read_cloud, read_mask
 from vatmart_jax.perception.networks import Networks, NetworksConfig
 from vatmart_jax.perception.pointnet2 import Level, PointNetConfig
 
@@ -137,8 +139,11 @@ def test_damaged_priors_are_refused_in_one_line(priors: Priors, tmp_path: Path, 
 def test_exported_stablehlo_computes_what_the_priors_do(priors: Priors, points: np.ndarray, tmp_path: Path) -> None:
     files = export(priors, tmp_path / "out", n_proposals=10)
     assert {str(f.relative_to(tmp_path / "out")) for f in files} == {
-        "flax/config.json", "flax/params.msgpack", "stablehlo/priors.bin", "stablehlo/signature.json",
-    }  # fmt: skip
+        "flax/config.json",
+        "flax/params.msgpack",
+        "stablehlo/priors.bin",
+        "stablehlo/signature.json",
+    }
     assert Priors.load(tmp_path / "out" / "flax").config == priors.config
     signature = json.loads((tmp_path / "out/stablehlo/signature.json").read_text())
     assert signature["inputs"]["points"] == {"shape": [64, 3], "dtype": "float32"}
@@ -154,3 +159,83 @@ def test_an_unknown_export_format_writes_nothing(priors: Priors, tmp_path: Path)
     with pytest.raises(ExportError, match="--format onnx: not one of flax, stablehlo"):
         export(priors, tmp_path / "out", ("flax", "onnx"))
     assert not (tmp_path / "out").exists()
+
+
+def test_the_command_predicts_what_the_library_does(priors: Priors, points: np.ndarray, tmp_path: Path, capsys) -> None:
+    priors.save(tmp_path / "run" / "priors")
+    np.save(tmp_path / "cloud.npy", points)
+    trimesh.PointCloud(points).export(tmp_path / "cloud.ply")
+    printed = []
+    for cloud in ("cloud.npy", "cloud.ply"):
+        main(
+            [
+                "predict",
+                str(tmp_path / "run"),
+                "--cloud",
+                str(tmp_path / cloud),
+                "--task",
+                "0.3",
+                "--out",
+                str(tmp_path / "found.npz"),
+                "--json",
+            ]
+        )
+        printed.append(json.loads(capsys.readouterr().out.splitlines()[-1]))
+    found = priors.predict(points, 0.3)
+    assert printed[0] == printed[1]
+    assert printed[0]["contact"] == found.contact.tolist()
+    assert printed[0]["actionability_max"] == pytest.approx(float(found.actionability.max()))
+    np.testing.assert_array_equal(np.float32(printed[0]["trajectories"]), found.trajectories)
+    with np.load(tmp_path / "found.npz") as saved:
+        np.testing.assert_array_equal(saved["scores"], found.scores)
+
+
+@pytest.mark.parametrize(
+    "text, task, value",
+    [
+        ("30deg", "push-door", np.pi / 6),
+        ("0.5rad", "pull-door", 0.5),
+        ("0.5", "push-door", 0.5),
+        ("0.3", "pull-drawer", 0.3),
+    ],
+)
+def test_amounts_are_read_in_the_tasks_unit(text: str, task: str, value: float) -> None:
+    assert amount(text, task) == pytest.approx(value)
+
+
+@pytest.mark.parametrize(
+    "text, task", [("30deg", "push-drawer"), ("-1", "push-door"), ("nan", "push-door"), ("", "push-door")]
+)
+def test_amounts_that_make_no_sense_are_refused(text: str, task: str) -> None:
+    with pytest.raises(PriorsError, match="expected an amount above 0 such as"):
+        amount(text, task)
+
+
+@pytest.mark.parametrize(
+    "name, content, message",
+    [
+        ("cloud.npy", np.zeros((5, 2)), r"expected numbers \[N, 3\], found float64 \(5, 2\)"),
+        ("cloud.npy", np.full((5, 3), np.nan), "not finite"),
+        ("cloud.npy", np.array([{"a": 1}]), "cannot be read"),
+        ("cloud.txt", np.zeros((5, 3)), "expected a .npy or .ply file"),
+    ],
+)
+def test_a_cloud_that_is_none_is_refused(tmp_path: Path, name: str, content: np.ndarray, message: str) -> None:
+    with (tmp_path / name).open("wb") as f:
+        np.save(f, content, allow_pickle=True)
+    with pytest.raises(PriorsError, match=message):
+        read_cloud(tmp_path / name)
+
+
+def test_a_mask_of_another_size_is_refused(tmp_path: Path) -> None:
+    np.save(tmp_path / "mask.npy", np.ones(5, bool))
+    with pytest.raises(PriorsError, match="expected 6 booleans"):
+        read_mask(tmp_path / "mask.npy", 6)
+
+
+def test_the_command_exports_priors_that_load(priors: Priors, tmp_path: Path, capsys) -> None:
+    priors.save(tmp_path / "run" / "priors")
+    main(["export", str(tmp_path / "run"), "--out", str(tmp_path / "out"), "--format", "flax", "--json"])
+    files = json.loads(capsys.readouterr().out.splitlines()[-1])["files"]
+    assert {Path(f).name for f in files} == {"config.json", "params.msgpack"}
+    assert Priors.load(tmp_path / "out" / "flax").config == priors.config
