@@ -83,7 +83,7 @@ class Explorer:
             action = jnp.where(jnp.arange(len(action))[:, None] < expert * len(action), shown, action)
             after = self.env.step(state, action, abandon)
             record = Episode(
-                state.obs, action, after.reward, after.obs, after.done, ~state.done,
+                state.obs, action, after.reward, after.obs, after.done, ~state.done & ~after.physics.diverged,
                 state.moved, after.moved, after.info["tip_distance"], after.held,
             )  # fmt: skip
             return after, record
