@@ -12,7 +12,7 @@ test: $(VENV)/.installed-test ## lint, types and tests
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/pyright --pythonpath $(BIN)/python
-	$(BIN)/python -m pytest
+	$(BIN)/python -m pytest -n auto --dist loadfile
 
 clean: ## remove the virtual environment and the demo's results
 	rm -rf $(VENV) runs/demo
