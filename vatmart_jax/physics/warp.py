@@ -99,6 +99,9 @@ class _Worlds:
         model = copy.copy(template.model)
         # Warp has no midphase, and refuses the flag that turns it off.
         model.opt.disableflags &= ~int(mujoco.mjtDisableBit.mjDSBL_MIDPHASE)
+        if not (model.geom_type == mujoco.mjtGeom.mjGEOM_MESH).any():
+            # Then two boxes collide as they do in C, rather than as any two convex shapes.
+            model.opt.disableflags |= int(mujoco.mjtDisableBit.mjDSBL_NATIVECCD)
         self._fields = []  # (values of all Scenes, rows of the worlds), two-dimensional
         with wp.ScopedDevice(device):
             self.model = mjw.put_model(model, batch_sizes=dict.fromkeys(_FIELDS, n))
