@@ -54,6 +54,16 @@ def test_boxes_end_where_the_c_implementation_puts_them(doors):
     assert pushed > 2 * BATCH
 
 
+def test_a_hand_at_its_force_limit_moves_as_in_c(doors):
+    scene, pose, qpos = doors.starts()
+    pose[:, :3] = [-5, 0, 0]
+    ctrl = np.tile(np.array([1, -1, 2, 0.5, 0, 0, 0.04, 0.04], np.float32), (BATCH, STEPS, 1))
+    ours = doors.rollout(doors.reset(scene, pose, qpos), ctrl, EVERYONE)
+    theirs = doors.c.rollout(doors.c.reset(scene, pose, qpos), ctrl, EVERYONE)
+    np.testing.assert_allclose(ours.qpos, theirs.qpos, atol=1e-4)
+    np.testing.assert_allclose(ours.qvel, theirs.qvel, atol=1e-3)
+
+
 def test_hands_inside_an_object_are_in_contact_from_the_start(doors):
     scene, pose, qpos = doors.starts()
     inside = pose.copy()

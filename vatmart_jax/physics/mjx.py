@@ -124,7 +124,11 @@ class MjxPhysics:
     def _step(self, row: SceneRow, pose, near: Slots, qpos, qvel, warmstart, ctrl):
         """One step of one simulation: its new qpos, qvel, qacc_warmstart, and whether it is in contact."""
         data = self._data.replace(qpos=qpos, qvel=qvel, qacc_warmstart=warmstart, ctrl=ctrl)
-        data = mjx.step(self._with_slots(self._placed(row, pose), near), data)
+        model = self._with_slots(self._placed(row, pose), near)
+        data = mjx.forward(model, data)
+        # An actuator at its force limit has no damping to integrate implicitly: C leaves it out, MJX 3.17 does not.
+        free = jnp.abs(data.actuator_force) < model.actuator_forcerange[:, 1]
+        data = mjx.implicit(model.replace(actuator_biasprm=model.actuator_biasprm * free[:, None]), data)
         return data.qpos, data.qvel, data.qacc_warmstart, _touches(data)
 
     def _placed(self, row: SceneRow, pose: jax.Array) -> mjx.Model:
