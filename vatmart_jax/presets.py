@@ -67,16 +67,16 @@ class Settings:
 
 PRESETS = {
     "quick": Settings(
-        explore=ExploreConfig(iterations=90, pool=2048),
+        explore=ExploreConfig(iterations=60, pool=2048),
         perception=PerceptionConfig(networks=NetworksConfig(pointnet=SMALL), proposals=32),
     ),
     "cpu": Settings(
         env=EnvConfig(batch=512),
-        explore=ExploreConfig(iterations=300, pool=16384),
+        explore=ExploreConfig(iterations=100, pool=16384),
         perception=PerceptionConfig(networks=NetworksConfig(pointnet=SMALL)),
         schedule=Schedule(
-            samples=400_000, collect=100, scorer=4000, proposal=4000, actionability=1000, curiosity=20,
-            curiosity_steps=100, finetune=8, finetune_batches=30, finetune_steps=1500,
+            samples=400_000, collect=100, scorer=3000, proposal=4000, actionability=600, curiosity=10,
+            curiosity_steps=100, finetune=12, finetune_batches=12, finetune_steps=1000,
         ),
     ),
     "gpu": Settings(
