@@ -35,6 +35,7 @@ from conversion.mjcf import MjcfConfig, to_mjcf
 from conversion.partnet import ConvertedObject, ObjectError
 from conversion.report import contact_sheet, page, picture, read_png, save_png
 from conversion.scenes import scene_bank
+from conversion.textures import read_mtl
 from conversion.views import views
 from vatmart_jax.bank import SceneBank
 
@@ -43,6 +44,7 @@ TRAIN_CATEGORIES = ("StorageFurniture", "Door", "Microwave", "Refrigerator")  # 
 TEST_CATEGORIES = ("Safe", "Table", "WashingMachine")
 SPLITS = ("train", "test_shapes", "test_categories", "extra")
 _SOURCE_SUFFIXES = (".urdf", ".json", ".txt", ".obj", ".stl", ".ply")
+_TEXTURE_SUFFIXES = (".mtl", ".png", ".jpg", ".jpeg", ".bmp", ".gif")
 
 
 @dataclass(frozen=True)
@@ -67,6 +69,8 @@ class ConvertConfig(DecomposeConfig, MjcfConfig, ViewConfig):
     """Scenes per door or drawer: all other parts closed, then with some of them open."""
     allow_missing: bool = False
     """Convert links that lack more than half of their meshes, too, without these. Fewer are left out and noted."""
+    textures: bool = False
+    """Carry materials and images of the OBJ files over to model.xml; without, links have colours by role."""
     continuous_range: bool = False
     """Let joints without a limit turn or slide without end, instead of refusing the object."""
     time_limit: float = 120.0
@@ -156,8 +160,9 @@ def _key(folder: Path, config: ConvertConfig, split: str | None) -> str:
     settings = {name: value for name, value in asdict(config).items() if name not in others}
     digest = hashlib.sha256(json.dumps([settings, split, _versions()], sort_keys=True).encode())
     digest.update(_source())
+    suffixes = _SOURCE_SUFFIXES + (_TEXTURE_SUFFIXES if config.textures else ())
     for path in sorted(folder.rglob("*")):
-        if path.suffix.lower() in _SOURCE_SUFFIXES and path.is_file():
+        if path.suffix.lower() in suffixes and path.is_file():
             digest.update(str(path.relative_to(folder)).encode())
             # A link out of the folder is refused later and not read now.
             if path.resolve().is_relative_to(folder.resolve()):
@@ -168,7 +173,7 @@ def _key(folder: Path, config: ConvertConfig, split: str | None) -> str:
 @cache
 def _source() -> bytes:
     """Of the modules that an object's conversion runs."""
-    functions = (partnet.read_object, decompose, boxes, to_mjcf, scene_bank, within_budget, shapes)
+    functions = (partnet.read_object, read_mtl, decompose, boxes, to_mjcf, scene_bank, within_budget, shapes)
     return "".join(inspect.getsource(sys.modules[f.__module__]) for f in functions).encode()
 
 
@@ -201,7 +206,12 @@ def default_split(category: str, object_id: str) -> str:
 def _convert_one(folder: Path, out: Path, config: ConvertConfig, split: str | None, key: str) -> None:
     """One object folder, complete or not at all."""
     start = time.process_time()
-    obj = partnet.read_object(folder, continuous_range=config.continuous_range, allow_missing=config.allow_missing)
+    obj = partnet.read_object(
+        folder,
+        continuous_range=config.continuous_range,
+        allow_missing=config.allow_missing,
+        textures=config.textures,
+    )
     parts, left_out = partnet.parts(obj)
     hulls, groups, found = {}, {}, []
     for root in obj.groups:

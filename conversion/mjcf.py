@@ -6,6 +6,7 @@ Written as XML here rather than by MjSpec: MuJoCo's writer keeps six digits, whi
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from xml.etree import ElementTree
@@ -15,7 +16,8 @@ import mujoco
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from conversion.partnet import ConvertedObject, Joint, ObjectError
+from conversion.partnet import ConvertedObject, Joint, ObjectError, Visual
+from conversion.textures import Material
 
 VISUAL_GROUP, COLLISION_GROUP = 2, 3
 BODY_RGBA, HANDLE_RGBA = "0.80 0.78 0.74 1", "0.25 0.25 0.28 1"
@@ -63,7 +65,7 @@ def to_mjcf(converted: ConvertedObject, config: MjcfConfig) -> Mjcf:
     """
     obj = converted.obj
     root = Element("mujoco", model=f"{obj.category}_{obj.id}")
-    SubElement(root, "compiler", angle="radian", meshdir="assets", autolimits="false")
+    compiler = SubElement(root, "compiler", angle="radian", meshdir="assets", autolimits="false")
     SubElement(root, "option", integrator="implicitfast")
     default = SubElement(root, "default")
     SubElement(
@@ -81,12 +83,29 @@ def to_mjcf(converted: ConvertedObject, config: MjcfConfig) -> Mjcf:
     world = SubElement(root, "worldbody")
     bodies: dict[str, Element] = {}
     assets: dict[str, bytes] = {}
+    materials: dict[Material, str] = {}
+    textures: dict[bytes, str] = {}
     geom_names: Counter[str] = Counter()
     colors = {p.link: PART_RGBA[i % len(PART_RGBA)] for i, p in enumerate(converted.parts)}
 
     def unique(name: str) -> str:
         geom_names[name] += 1
         return name if geom_names[name] == 1 else f"{name}.{geom_names[name] - 1}"
+
+    def named(material: Material) -> str:
+        if material not in materials:
+            materials[material] = f"material_{len(materials)}"
+            element = SubElement(asset, "material", name=materials[material], rgba=_text(material.rgba))
+            if material.png is not None:
+                if material.png not in textures:
+                    textures[material.png] = f"texture_{len(textures)}"
+                    compiler.set("texturedir", "assets")
+                    assets[f"{textures[material.png]}.png"] = material.png
+                    SubElement(
+                        asset, "texture", name=textures[material.png], type="2d", file=f"{textures[material.png]}.png"
+                    )
+                element.set("texture", textures[material.png])
+        return materials[material]
 
     for name, link in obj.links.items():
         joint = obj.joints.get(name)
@@ -101,13 +120,15 @@ def to_mjcf(converted: ConvertedObject, config: MjcfConfig) -> Mjcf:
             SubElement(custom, "text", name=f"semantics:{name}", data=link.semantics)
         color = colors.get(obj.group_root(name), BODY_RGBA)
         for v in link.visuals:
-            mesh = f"visual_{len(assets)}"
-            assets[f"{mesh}.obj"] = _obj(v.vertices, v.faces)
-            SubElement(asset, "mesh", name=mesh, file=f"{mesh}.obj", inertia="shell")
-            SubElement(
-                body, "geom", {"class": "visual"}, name=unique(f"{name}/{v.name}"), mesh=mesh,
-                rgba=HANDLE_RGBA if v.is_handle else color,
-            )  # fmt: skip
+            for vertices, faces, uv, material in _pieces(v):
+                mesh = f"visual_{len(assets)}"
+                assets[f"{mesh}.obj"] = _obj(vertices, faces, uv)
+                SubElement(asset, "mesh", name=mesh, file=f"{mesh}.obj", inertia="shell")
+                geom = SubElement(body, "geom", {"class": "visual"}, name=unique(f"{name}/{v.name}"), mesh=mesh)
+                if material is None:
+                    geom.set("rgba", HANDLE_RGBA if v.is_handle else color)
+                else:
+                    geom.set("material", named(material))
     for group, hulls in converted.hulls.items():
         home, frame = _home(converted, group)
         for i, hull in enumerate(hulls):
@@ -176,12 +197,31 @@ def _home(converted: ConvertedObject, group: str) -> tuple[str, np.ndarray]:
     return home, np.linalg.inv(obj.link_poses()[home])
 
 
-def _obj(vertices: np.ndarray, faces: np.ndarray) -> bytes:
+def _pieces(visual: Visual) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray | None, Material | None]]:
+    """Vertices, faces, texture coordinates [m, 3, 2] of their corners, and material: MuJoCo has one per geom."""
+    if visual.skin is None:
+        yield visual.vertices, visual.faces, None, None
+        return
+    for i in np.unique(visual.skin.material):
+        rows, material = visual.skin.material == i, visual.skin.materials[i]
+        used, faces = np.unique(visual.faces[rows], return_inverse=True)
+        uv = visual.skin.uv[rows] if material is not None and material.png is not None else None
+        yield visual.vertices[used], faces.reshape(-1, 3), uv, material
+
+
+def _obj(vertices: np.ndarray, faces: np.ndarray, uv: np.ndarray | None) -> bytes:
     """Both sides of every face, on vertices of their own: windings of the dataset are random, renderers cull."""
     if len(vertices) == 3:  # MuJoCo wants four
         vertices = np.concatenate([vertices, vertices[:1]])
     n = len(vertices)
     both = np.concatenate([vertices, vertices])
+    corners = np.concatenate([faces, faces[:, ::-1] + n]) + 1
     lines = [f"v {x:.7g} {y:.7g} {z:.7g}" for x, y, z in both]
-    lines += [f"f {a} {b} {c}" for a, b, c in np.concatenate([faces, faces[:, ::-1] + n]) + 1]
+    if uv is None:
+        lines += [f"f {a} {b} {c}" for a, b, c in corners]
+    else:
+        points, index = np.unique(np.concatenate([uv, uv[:, ::-1]]).reshape(-1, 2), axis=0, return_inverse=True)
+        lines += [f"vt {x:.7g} {y:.7g}" for x, y in points]
+        pairs = zip(corners, index.reshape(-1, 3) + 1, strict=True)
+        lines += [f"f {a}/{i} {b}/{j} {c}/{k}" for (a, b, c), (i, j, k) in pairs]
     return "\n".join(lines).encode() + b"\n"

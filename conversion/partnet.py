@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import io
 import json
+import os
 import re
 import zipfile
 from collections.abc import Iterable, Iterator, Mapping
@@ -23,12 +24,14 @@ from scipy.spatial import ConvexHull, QhullError
 from scipy.spatial.transform import Rotation
 from trimesh.ray.ray_pyembree import RayMeshIntersector
 
+from conversion.textures import Material, Skin, read_mtl, read_png
 from vatmart_jax.errors import UserError
 
 MAX_COORDINATE = 1e3  # objects are normalised to about 2 unit lengths; anything near this is damage
 MAX_FILE_BYTES = 256 * 2**20
 MIN_SWING = np.deg2rad(10)  # a joint that travels less is no task
 MIN_SLIDE = 0.1
+TEXTURE_SIZE = 512  # pixels; larger pictures are made smaller
 
 HANDLE_WORDS = ("handle", "knob", "pull")
 # Links that move but are neither door nor drawer, by their own semantics or because all their visuals are such.
@@ -49,6 +52,7 @@ class Visual:
     faces: np.ndarray  # [m, 3] int64, each triangle once, winding meaningless
     is_handle: bool
     file: str | None  # relative to the object folder; None for a primitive
+    skin: Skin | None = None  # where materials were asked for and the file names some
 
 
 @dataclass(frozen=True)
@@ -255,6 +259,13 @@ class ConvertedObject:
         return cls(obj, hulls, parts, [(j, why) for j, why in text["left_out"]], text["split"])
 
 
+@dataclass(frozen=True)
+class _Mesh:
+    vertices: np.ndarray  # [n, 3] float64
+    faces: np.ndarray  # [m, 3] int64
+    skin: Skin | None = None
+
+
 def _pack(arrays: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
     start = np.cumsum([0] + [len(a) for a in arrays])
     return (np.concatenate(arrays) if arrays else np.zeros((0, 3))), start
@@ -267,8 +278,10 @@ class _Reader:
     folder: Path
     continuous_range: bool
     allow_missing: bool
+    textures: bool
     notes: list[str] = field(default_factory=list)
-    meshes: dict[str, tuple[np.ndarray, np.ndarray] | None] = field(default_factory=dict)
+    meshes: dict[str, _Mesh | None] = field(default_factory=dict)
+    pictures: dict[str, bytes | None] = field(default_factory=dict)
 
     def error(self, what: str, file: str) -> ObjectError:
         return ObjectError(f"{self.folder.name}/{file}: {what}")
@@ -286,6 +299,11 @@ class _Reader:
             raise self.error(f"larger than {MAX_FILE_BYTES >> 20} MiB; simplify it", name)
         return path
 
+    def note(self, what: str) -> None:
+        """Once, however many files give rise to it."""
+        if what not in self.notes:
+            self.notes.append(what)
+
     def text(self, name: str) -> str | None:
         """A small side file, or None where it is missing or unreadable: nothing depends on one alone."""
         try:
@@ -302,13 +320,15 @@ class _Reader:
 
 
 @np.errstate(invalid="ignore", over="ignore")  # what is not finite is refused by name
-def read_object(folder: Path, *, continuous_range: bool = False, allow_missing: bool = False) -> PartNetObject:
+def read_object(
+    folder: Path, *, continuous_range: bool = False, allow_missing: bool = False, textures: bool = False
+) -> PartNetObject:
     """Read `mobility.urdf` (or `mobility_vhacd.urdf`), its visual meshes and the annotation beside it.
 
     continuous_range: a joint without limits may move without end. A link may lack up to half of its meshes, which is
-    noted; allow_missing: or any number. Raises ObjectError.
+    noted; allow_missing: or any number. textures: visuals get a skin. Raises ObjectError.
     """
-    reader = _Reader(Path(folder), continuous_range, allow_missing)
+    reader = _Reader(Path(folder), continuous_range, allow_missing, textures)
     names = ("mobility.urdf", "mobility_vhacd.urdf")
     urdf = next((n for n in names if reader.path(n, n).is_file()), None)
     if urdf is None:
@@ -443,7 +463,7 @@ def _visuals(reader: _Reader, urdf: str, link: yourdfpy.Link) -> Iterator[Visual
     wanted = [(v, v.geometry) for v in link.visuals if v.geometry is not None]
     missing, empty = [], []
     for i, (visual, geometry) in enumerate(wanted):
-        file = None
+        file, skin = None, None
         if geometry.mesh is not None:
             file = geometry.mesh.filename
             if not file:
@@ -451,7 +471,7 @@ def _visuals(reader: _Reader, urdf: str, link: yourdfpy.Link) -> Iterator[Visual
             if (mesh := _mesh(reader, urdf, file)) is None:
                 missing.append(file)
                 continue
-            vertices, faces = mesh
+            vertices, faces, skin = mesh.vertices, mesh.faces, mesh.skin
             scale = np.asarray(1.0 if geometry.mesh.scale is None else geometry.mesh.scale, np.float64)
             if scale.shape not in ((), (3,)) or not np.isfinite(scale).all():
                 raise reader.error(f"link {link.name!r}: mesh scale {scale}; expected one or three numbers", urdf)
@@ -463,13 +483,14 @@ def _visuals(reader: _Reader, urdf: str, link: yourdfpy.Link) -> Iterator[Visual
         if not (np.isfinite(vertices).all() and np.abs(vertices).max(initial=0) < MAX_COORDINATE):
             what = f"link {link.name!r}, visual {visual.name or i!r}: coordinates not finite or beyond"
             raise reader.error(f"{what} {MAX_COORDINATE:g} unit lengths; repair them", file or urdf)
-        vertices, faces = clean(vertices, faces)
+        vertices, faces, kept = cleaned(vertices, faces)
         if not len(faces):
             empty.append(file)
             continue
         name = visual.name or f"{link.name}_{i}"
         words = f"{visual.name or ''} {link.name}".lower()
-        yield Visual(name, vertices, faces, any(w in words for w in HANDLE_WORDS), file)
+        is_handle = any(w in words for w in HANDLE_WORDS)
+        yield Visual(name, vertices, faces, is_handle, file, None if skin is None else skin.of(kept))
     if missing:
         what = f"link {link.name!r}: {len(missing)} of {len(wanted)} meshes missing"
         if 2 * len(missing) > len(wanted) and not reader.allow_missing:
@@ -497,7 +518,7 @@ def _primitive(reader: _Reader, urdf: str, link: str, geometry: yourdfpy.Geometr
     return np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces, np.int64)
 
 
-def _mesh(reader: _Reader, urdf: str, file: str) -> tuple[np.ndarray, np.ndarray] | None:
+def _mesh(reader: _Reader, urdf: str, file: str) -> _Mesh | None:
     """Triangles of a mesh file, None where there is no such file."""
     if file in reader.meshes:
         return reader.meshes[file]
@@ -509,39 +530,98 @@ def _mesh(reader: _Reader, urdf: str, file: str) -> tuple[np.ndarray, np.ndarray
     elif path.suffix.lower() in (".stl", ".ply"):
         try:
             mesh = trimesh.load_mesh(path)
-            out = np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces, np.int64)
+            out = _Mesh(np.asarray(mesh.vertices, np.float64), np.asarray(mesh.faces, np.int64))
         except Exception as e:  # trimesh raises whatever its parsing runs into
             raise reader.error(f"not a readable mesh ({type(e).__name__}: {e}); repair it", file) from None
     else:
         raise reader.error(f"mesh format {path.suffix!r} is not read; use .obj, .stl or .ply", urdf)
-    if out is not None and not len(out[1]):
+    if out is not None and not len(out.faces):
         raise reader.error("mesh is empty, it has no faces; restore it or remove it from the URDF", file)
     reader.meshes[file] = out
     return out
 
 
-def _read_obj(reader: _Reader, file: str, path: Path) -> tuple[np.ndarray, np.ndarray]:
-    """Vertices and faces alone; polygons become fans. trimesh's reader wants materials and merges what it likes."""
+def _read_obj(reader: _Reader, file: str, path: Path) -> _Mesh:
+    """Vertices, faces and, where asked for, materials; polygons become fans.
+
+    trimesh's reader wants materials and merges what it likes.
+    """
     vertices: list[list[float]] = []
     faces: list[list[int]] = []
+    points: list[list[float]] = [[0.0, 0.0]]  # of texture; a corner without has the first
+    corners: list[list[int]] = []  # index into points
+    libraries: list[str] = []
+    used, materials = 0, {"": 0}
+    material: list[int] = []
+    wanted = ("v", "f", "vt", "usemtl", "mtllib") if reader.textures else ("v", "f")
     for number, line in enumerate(path.read_text(errors="replace").replace("\\\n", " ").splitlines(), 1):
         words = line.split()
-        if not words or words[0] not in ("v", "f"):
+        if not words or words[0] not in wanted:
             continue
         try:
             if words[0] == "v":
                 x, y, z = map(float, words[1:4])
                 vertices.append([x, y, z])
-            else:
+            elif words[0] == "f":
                 corner = [int(w.split("/", 1)[0]) for w in words[1:]]
                 corner = [i - 1 if i > 0 else len(vertices) + i for i in corner]
-                faces.extend([corner[0], corner[k], corner[k + 1]] for k in range(1, len(corner) - 1))
+                fan = [(0, k, k + 1) for k in range(1, len(corner) - 1)]
+                faces.extend([corner[i] for i in triangle] for triangle in fan)
+                if reader.textures:
+                    texture = [int((w + "//").split("/")[1] or 0) for w in words[1:]]
+                    texture = [i if i >= 0 else len(points) + i for i in texture]
+                    corners.extend([texture[i] for i in triangle] for triangle in fan)
+                    material.extend([used] * len(fan))
+            elif words[0] == "vt":
+                u, v = (*map(float, words[1:3]), 0.0)[:2]
+                points.append([u, v])
+            elif words[0] == "usemtl":
+                used = materials.setdefault(line.split(None, 1)[1].strip() if words[1:] else "", len(materials))
+            else:
+                libraries.append(" ".join(words[1:]))
         except ValueError:
             raise reader.error(f"line {number} {line[:40]!r} is no OBJ line; restore the mesh", file) from None
     v, f = np.array(vertices, np.float64).reshape(-1, 3), np.array(faces, np.int64).reshape(-1, 3)
     if len(f) and not (f.min() >= 0 and f.max() < len(v)):
         raise reader.error(f"a face names a vertex beyond the {len(v)} there are; restore the mesh", file)
-    return v, f
+    if len(materials) == 1:
+        return _Mesh(v, f)
+    index, uv = np.array(corners, np.int64).reshape(-1, 3), np.array(points)
+    index[(index < 0) | (index >= len(uv)) | ~np.isfinite(uv).all(axis=1).take(index, mode="clip")] = 0
+    skin = Skin(_materials(reader, file, libraries, list(materials)), np.array(material, np.int64), uv[index])
+    # Faces are there once per side, one of them often blank; the first copy will stay.
+    blank = np.array([m is None or m.png is None for m in skin.materials])
+    order = np.argsort(blank[skin.material], kind="stable")
+    return _Mesh(v, f[order], skin.of(order))
+
+
+def _materials(reader: _Reader, file: str, libraries: list[str], names: list[str]) -> tuple[Material | None, ...]:
+    """By name, from the MTL files an OBJ file names; None, and a note, where there is none. The first has no name."""
+    found = {}
+    beside = lambda f, name: os.path.normpath((Path(f).parent / name).as_posix())  # noqa: E731
+    for library in libraries:
+        if (text := reader.text(beside(file, library))) is None:
+            reader.note(f"material library {library!r} not readable inside the folder, plain colours")
+            continue
+        for name, (rgba, image) in read_mtl(text).items():
+            if image is not None and (png := _picture(reader, beside(beside(file, library), image))) is not None:
+                found[name] = Material((1.0, 1.0, 1.0, rgba[3]), png)
+            else:
+                found[name] = Material(rgba, None)
+    for name in names[1:]:
+        if libraries and found and name not in found:
+            reader.note(f"material {name!r} is in no library, plain colour")
+    return tuple(found.get(name) for name in names)
+
+
+def _picture(reader: _Reader, file: str) -> bytes | None:
+    if file not in reader.pictures:
+        try:
+            reader.pictures[file] = read_png(reader.path(file, file), TEXTURE_SIZE)
+        except (ObjectError, ValueError) as e:
+            reader.pictures[file] = None
+            reader.note(f"texture {file!r}: {e}, plain colour")
+    return reader.pictures[file]
 
 
 def clean(vertices: np.ndarray, faces: np.ndarray, merge: float = 1e-5) -> tuple[np.ndarray, np.ndarray]:
@@ -549,19 +629,25 @@ def clean(vertices: np.ndarray, faces: np.ndarray, merge: float = 1e-5) -> tuple
 
     Most meshes of the dataset hold every triangle twice, once per side.
     """
+    return cleaned(vertices, faces, merge)[:2]
+
+
+def cleaned(vertices: np.ndarray, faces: np.ndarray, merge: float = 1e-5) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The same, and which faces are left: index [k] into those given."""
+    kept = np.arange(len(faces))
     if not len(faces):
-        return vertices[:0], faces
+        return vertices[:0], faces, kept
     _, index, inverse = np.unique(np.round(vertices / merge), axis=0, return_index=True, return_inverse=True)
     vertices, faces = vertices[index], inverse.ravel()[faces]
     corners = np.sort(faces, axis=1)
-    faces = faces[(corners[:, 0] != corners[:, 1]) & (corners[:, 1] != corners[:, 2])]
-    if not len(faces):
-        return vertices[:0], faces
-    faces = faces[np.sort(np.unique(np.sort(faces, axis=1), axis=0, return_index=True)[1])]
-    a, b, c = vertices[faces].transpose(1, 0, 2)
-    faces = faces[np.linalg.norm(np.cross(b - a, c - a), axis=1) > 1e-12]
-    used, inverse = np.unique(faces, return_inverse=True)
-    return vertices[used], inverse.reshape(-1, 3)
+    kept = kept[(corners[:, 0] != corners[:, 1]) & (corners[:, 1] != corners[:, 2])]
+    if not len(kept):
+        return vertices[:0], faces[:0], kept
+    kept = kept[np.sort(np.unique(corners[kept], axis=0, return_index=True)[1])]
+    a, b, c = vertices[faces[kept]].transpose(1, 0, 2)
+    kept = kept[np.linalg.norm(np.cross(b - a, c - a), axis=1) > 1e-12]
+    used, inverse = np.unique(faces[kept], return_inverse=True)
+    return vertices[used], inverse.reshape(-1, 3), kept
 
 
 def parts(obj: PartNetObject) -> tuple[list[Part], list[tuple[str, str]]]:
