@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import os
 import re
 import shutil
 import subprocess
@@ -264,25 +265,71 @@ def budget(check: Check) -> dict[str, Any]:
     }
 
 
-def speed(check: Check, subset: int = 12) -> dict[str, Any]:
-    """5: seconds of one core per object; a second run; two processes against one on every n-th object."""
+def speed(check: Check, subset: int = 16) -> dict[str, Any]:
+    """5: seconds of one core per object; two processes against one on every n-th object, and what the machine gives.
+
+    The control is work in which nothing is shared: how much of a factor of 2 there is to have. Everything is timed
+    twice, in the order one, two, two, one, for neighbours of a shared server come and go. Start-up and banks (one
+    process) are timed by making the banks again.
+    """
     seconds = {r["id"]: r["seconds"] for r in check.reports()}
     slow = sorted(seconds, key=lambda k: -seconds[k])[:5]
     values = np.array(list(seconds.values()))
-    out: dict[str, Any] = {
+    names = sorted((n for n in seconds if seconds[n] < 20), key=lambda k: seconds[k])
+    names = names[:: max(1, len(names) // subset)][:subset]
+    wall: dict[int, list[float]] = {1: [], 2: []}
+    core: dict[int, list[float]] = {1: [], 2: []}
+    control: dict[int, list[float]] = {1: [], 2: []}
+    for jobs in (1, 2, 2, 1):
+        with tempfile.TemporaryDirectory() as out:
+            command = ("convert", *(check.src / n for n in names), "--out", out, "--views", "0", "--jobs", str(jobs))
+            wall[jobs].append(_vatmart(*command))
+            core[jobs].append(sum(json.loads(p.read_text())["seconds"] for p in Path(out).glob("*/report.json")))
+            (Path(out) / "scenes.npz").unlink()
+            fixed = _vatmart(*command)
+        control[jobs].append(_control(jobs))
+    one, two = sum(wall[1]) / 2, sum(wall[2]) / 2
+    return {
         "seconds": spread(values),
         "within_15": share(values, 15),
         "slowest": {k: seconds[k] for k in slow},
+        "two_against_one": {
+            "objects": len(names),
+            "wall_seconds": _by_processes(wall),
+            "start_up_and_banks": _round(fixed),
+            "core_seconds": _by_processes(core),
+            "control_seconds": _by_processes(control),
+            "times_as_fast": _round(one / two),
+            "times_as_fast_without_start_up_and_banks": _round((one - fixed) / (two - fixed)),
+            "times_as_fast_control": _round(2 * sum(control[1]) / sum(control[2])),
+        },
     }
-    names = sorted(seconds, key=lambda k: seconds[k])[:: max(1, len(seconds) // subset)]
-    names = [n for n in names if seconds[n] < 20]
-    with tempfile.TemporaryDirectory() as folder:
-        for jobs in (2, 1):
-            start = time.monotonic()
-            _vatmart("convert", *(check.src / n for n in names), "--out", Path(folder) / str(jobs),
-                     "--views", "0", "--jobs", str(jobs))  # fmt: skip
-            out[f"seconds_of_{len(names)}_with_{jobs}"] = round(time.monotonic() - start, 2)
-    return out
+
+
+def _by_processes(seconds: dict[int, list[float]]) -> dict[str, list[float]]:
+    return {"one": [_round(s) for s in seconds[1]], "two": [_round(s) for s in seconds[2]]}
+
+
+CONTROL = """
+import time, numpy as np
+from scipy.spatial import ConvexHull
+start, a = time.perf_counter(), np.random.default_rng(0).normal(size=(20000, 3))
+for _ in range(250):
+    ConvexHull(a)
+    np.unique(np.round(a, 2), axis=0)
+    sum(i * i for i in range(100_000))
+print(time.perf_counter() - start)
+"""
+
+
+def _control(processes: int) -> float:
+    """Seconds of the same work, nothing shared, in so many processes at once; start-up left out."""
+    environment = os.environ | dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
+    started = [
+        subprocess.Popen([sys.executable, "-c", CONTROL], env=environment, stdout=subprocess.PIPE, text=True)
+        for _ in range(processes)
+    ]
+    return max(float(p.communicate()[0]) for p in started)
 
 
 def again(check: Check) -> dict[str, Any]:
@@ -292,16 +339,17 @@ def again(check: Check) -> dict[str, Any]:
     flags = [w for k, v in changed.items() for w in ((f"--{k.replace('_', '-')}",) if v is True else
              (f"--{k.replace('_', '-')}", str(v)))]  # fmt: skip
     before = {p: p.stat().st_mtime_ns for p in check.out.glob("*/*")}
-    start = time.monotonic()
-    _vatmart("convert", check.src, "--out", check.out, *flags)
-    seconds = time.monotonic() - start
+    seconds = _vatmart("convert", check.src, "--out", check.out, *flags)
     same = before == {p: p.stat().st_mtime_ns for p in check.out.glob("*/*")}
     return {"seconds": round(seconds, 2), "nothing_written": same}
 
 
-def _vatmart(*words: str | Path) -> None:
+def _vatmart(*words: str | Path) -> float:
+    """Seconds that the command takes."""
     command = [sys.executable, "-m", "vatmart_jax.cli", *map(str, words)]
+    start = time.monotonic()
     subprocess.run(command, check=True, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    return time.monotonic() - start
 
 
 def rendering(check: Check, scenes: int = 48, per_scene: int = 2, points: int = 10_000, rays: int = 300) -> dict:
@@ -424,21 +472,20 @@ def steps(check: Check) -> dict[str, Any]:
     }
 
 
-def fuzz(check: Check, count: int = 200) -> dict[str, Any]:
+def fuzz(check: Check, folders: range = range(200)) -> dict[str, Any]:
     """9: mutated folders, each converted or refused in one line, and nothing written but in the out folder."""
-    rng = np.random.default_rng(check.seed)
     small = [r["id"] for r in sorted(check.reports(), key=lambda r: r["seconds"])[:40]]
     with tempfile.TemporaryDirectory() as name:
         root = Path(name)
         (root / "src").mkdir()
         (root / "secret.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n")
         did = {}
-        for i in range(count):
+        for i in folders:
             folder = root / "src" / f"{i:03d}"
             shutil.copytree(check.src / small[i % len(small)], folder)
             mutate = MUTATIONS[i % len(MUTATIONS)]
             did[folder.name] = mutate.__name__
-            mutate(folder, rng)
+            mutate(folder, np.random.default_rng((check.seed, i)))
         before = _listing(root)
         start = time.monotonic()
         result = convert([root / "src"], root / "out", ConvertConfig(views=0, time_limit=60), jobs=2)
@@ -454,7 +501,7 @@ def fuzz(check: Check, count: int = 200) -> dict[str, Any]:
             short = re.sub(r"^\d+/[^:]*", "FILE", re.sub(r"'[^']*'|-?\d[\d.e+-]*", "_", f["reason"]))[:70]
             reasons[short] = reasons.get(short, 0) + 1
         return {
-            "folders": count,
+            "folders": len(folders),
             "converted": result.converted,
             "refused": len(result.failed),
             "unclear": [{**f, "mutation": did[f["id"]]} for f in unclear],
