@@ -126,19 +126,20 @@ def _train(argv: list[str]) -> None:
         """a folder of objects, or what `vatmart convert` made of it; default the bundled objects"""
         preset: str = chosen
         """quick, cpu, gpu or paper; the flags below start from it"""
-        impl: str = "c"
-        """physics"""
+        impl: str | None = None
+        """physics: c, warp or jax; default warp on an NVIDIA GPU, else c"""
         seed: int = 0
         json: _Json = False
         settings: Annotated[Settings, arg(name="")] = field(default_factory=lambda: PRESETS[chosen])
 
     args = tyro.cli(Train, args=argv, prog="vatmart train")
     _enable_compilation_cache()
+    from vatmart_jax.physics.interface import default_impl
     from vatmart_jax.pipeline.run import check_folder
     from vatmart_jax.progress import Bars
     from vatmart_jax.training import resolve, train
 
-    config = resolve(args.task, args.preset, args.impl, args.seed, args.settings, args.data)
+    config = resolve(args.task, args.preset, args.impl or default_impl(), args.seed, args.settings, args.data)
     check_folder(args.out, config)
     with Bars() as bars:
         points = args.settings.perception.networks.pointnet.n_points
@@ -164,6 +165,8 @@ def _evaluate(argv: list[str]) -> None:
         """of downstream: ours, random, expert (a script that knows the joint: the ceiling)"""
         trials: int = 350
         """per method and split"""
+        impl: str | None = None
+        """physics; default as for training"""
         seed: int = 1
         out: Path | None = None
         """folder for evaluation.json and evaluation.md; default the run folder"""
@@ -174,6 +177,7 @@ def _evaluate(argv: list[str]) -> None:
         raise UserError("no run; give one or more run folders of `vatmart train`")
     _enable_compilation_cache()
     from vatmart_jax.evaluation.evaluate import evaluate
+    from vatmart_jax.physics.interface import default_impl
     from vatmart_jax.progress import Bars
 
     with Bars() as bars:
@@ -184,6 +188,7 @@ def _evaluate(argv: list[str]) -> None:
             tuple(args.metrics.split(",")),
             tuple(args.methods.split(",")),
             args.trials,
+            args.impl or default_impl(),
             args.seed,
             args.out,
             bars,

@@ -20,6 +20,7 @@ from vatmart_jax.evaluation.priors import labelled, priors_metrics
 from vatmart_jax.expert import run_expert
 from vatmart_jax.inference import Priors
 from vatmart_jax.perception.train import clouds_of
+from vatmart_jax.physics.interface import IMPLS
 from vatmart_jax.pipeline.collect import ProposalTrials
 from vatmart_jax.pipeline.explore import Explorer
 from vatmart_jax.pipeline.run import read_config, write_json, write_text
@@ -39,6 +40,7 @@ def evaluate(
     metrics: Sequence[str],
     methods: Sequence[str],
     trials: int,
+    impl: str,
     seed: int,
     out: Path | None,
     report: Report,
@@ -52,12 +54,14 @@ def evaluate(
         for name in given:
             if name not in known:
                 raise UserError(f"{flag} {name}: not one of {', '.join(known)}")
+    if impl not in IMPLS:
+        raise UserError(f"--impl {impl}: not one of {', '.join(IMPLS)}")
     if trials < 1:
         raise UserError(f"--trials {trials}: must be at least 1")
     begun = time.monotonic()
     evaluated = []
     for folder in runs:
-        result = _evaluate_run(Path(folder), prepared, data, metrics, methods, trials, seed, report)
+        result = _evaluate_run(Path(folder), prepared, data, metrics, methods, trials, impl, seed, report)
         evaluated.append(result)
         if out is None:
             _write(Path(folder), {"runs": [result]})
@@ -68,7 +72,7 @@ def evaluate(
     return everything, _tables(evaluated)
 
 
-def _evaluate_run(folder, prepared, data, metrics, methods, trials, seed, report) -> dict[str, Any]:
+def _evaluate_run(folder, prepared, data, metrics, methods, trials, impl, seed, report) -> dict[str, Any]:
     config = read_config(folder)
     task = TASKS[config["task"]]
     priors = Priors.load(folder / "priors")
@@ -78,7 +82,7 @@ def _evaluate_run(folder, prepared, data, metrics, methods, trials, seed, report
     rows, scores = [], []
     for number, split in enumerate(SPLITS[1:]):
         try:
-            env = converted.env(split, task, config["impl"], settings.env, settings.physics)
+            env = converted.env(split, task, impl, settings.env, settings.physics)
         except DataError as e:
             report(f"{split} left out: {e}", 1, 1, {})
             continue

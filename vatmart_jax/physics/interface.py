@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from importlib.util import find_spec
 from typing import Protocol
 
 import jax
@@ -39,6 +40,11 @@ class Physics(Protocol):
     def rollout(self, state: PhysicsState, ctrl: jax.Array, active: jax.Array) -> PhysicsState:
         """Apply ctrl [B, T, 8] (hand x y z rx ry rz, fingers), one row per step, where active [B]; others stay."""
         ...
+
+
+def default_impl() -> str:
+    """`warp` where JAX runs on an NVIDIA GPU and MuJoCo Warp is installed, else `c`."""
+    return "warp" if jax.default_backend() == "gpu" and find_spec("mujoco_warp") else "c"
 
 
 def make_physics(bank: SceneBank, impl: str = "c", config: PhysicsConfig | None = None) -> Physics:
