@@ -265,7 +265,7 @@ def budget(check: Check) -> dict[str, Any]:
     }
 
 
-def speed(check: Check, subset: int = 16) -> dict[str, Any]:
+def speed(check: Check, subset: int = 12) -> dict[str, Any]:
     """5: seconds of one core per object; two processes against one on every n-th object, and what the machine gives.
 
     The control is work in which nothing is shared: how much of a factor of 2 there is to have. Everything is timed

@@ -27,7 +27,7 @@ CONFIG = DecomposeConfig()
 LINKS = (
     ("45194", "static"), ("46120", "part"), ("41083", "part"), ("45621", "static"), ("12036", "static"),
     ("11178", "part"), ("7310", "static"), ("7167", "part"), ("8877", "part"), ("101599", "static"), ("22301", "part"),
-    ("100129", "static"), ("102055", "part"),
+    ("100129", "static"), ("102055", "static"),
 )  # fmt: skip
 
 
