@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 from mujoco import mjx
-from mujoco.mjx._src import mesh  # nothing public makes a ConvexMesh; mujoco-mjx is pinned to one minor version
+from mujoco.mjx._src import math, mesh  # no public names for these; mujoco-mjx is pinned to one minor version
 
 from vatmart_jax import geometry as g
 from vatmart_jax.bank import SceneBank
@@ -125,11 +125,21 @@ class MjxPhysics:
         """One step of one simulation: its new qpos, qvel, qacc_warmstart, and whether it is in contact."""
         data = self._data.replace(qpos=qpos, qvel=qvel, qacc_warmstart=warmstart, ctrl=ctrl)
         model = self._with_slots(self._placed(row, pose), near)
-        data = mjx.forward(model, data)
+        data = self._forward(model, data)
         # An actuator at its force limit has no damping to integrate implicitly: C leaves it out, MJX 3.17 does not.
         free = jnp.abs(data.actuator_force) < model.actuator_forcerange[:, 1]
         data = mjx.implicit(model.replace(actuator_biasprm=model.actuator_biasprm * free[:, None]), data)
         return data.qpos, data.qvel, data.qacc_warmstart, _touches(data)
+
+    def _forward(self, model: mjx.Model, data: mjx.Data) -> mjx.Data:
+        """`mjx.forward`, with the contacts put right in its middle."""
+        for stage in (mjx.kinematics, mjx.com_pos, mjx.crb, mjx.factor_m, mjx.collision):
+            data = stage(model, data)
+        data = _without_copies(data if self._meshes is not None else _with_edges(model, data))
+        solve = (mjx.fwd_velocity, mjx.fwd_actuation, mjx.fwd_acceleration, mjx.solve)
+        for stage in (mjx.make_constraint, mjx.transmission, *solve):
+            data = stage(model, data)
+        return data
 
     def _placed(self, row: SceneRow, pose: jax.Array) -> mjx.Model:
         """The model of one simulation: its Scene, but for the geoms, and its gripper's start pose."""
@@ -196,6 +206,53 @@ def _convex_meshes(model: mujoco.MjModel) -> mjx._src.types.ConvexMesh:
         return jnp.stack([np.pad(a, [(0, n - m) for n, m in zip(size, a.shape, strict=True)], "edge") for a in arrays])
 
     return jax.tree.map(stacked, *meshes)
+
+
+def _with_edges(model: mjx.Model, data: mjx.Data) -> mjx.Data:
+    """Contacts of two boxes between edges wherever these overlap less than any face does, at their nearest points, as
+    in C. MJX prefers faces that are nearly as good, and takes face points for edges: tilted grasps then differ.
+    """
+    contact = data._impl.contact
+    pos, mat, half = (x[contact.geom] for x in (data.geom_xpos, data.geom_xmat, model.geom_size))  # [C, 2, ...]
+    apart = pos[:, 1] - pos[:, 0]
+    edges = jnp.cross(mat[:, 0, :, :, None], mat[:, 1, :, None, :], axis=1).reshape(-1, 3, 9)
+    length = jnp.linalg.norm(edges, axis=1)
+    axes = jnp.concatenate([mat[:, 0], mat[:, 1], edges / jnp.maximum(length, 1e-6)[:, None]], -1)  # [C, 3, 15]
+    reach = jnp.einsum("cbji,cjk->cbik", mat, axes)  # of the axes in each box's frame
+    along = jnp.einsum("cj,cjk->ck", apart, axes)
+    depth = jnp.einsum("cbi,cbik->ck", half, jnp.abs(reach)) - jnp.abs(along)
+    depth = depth.at[:, 6:].add(jnp.where(length < 1e-3, jnp.inf, 0.0))
+    best = depth[:, 6:].argmin(-1)
+    sign = jnp.sign(jnp.take_along_axis(along, 6 + best[:, None], 1))
+    normal = sign * jnp.take_along_axis(axes, 6 + best[:, None, None], 2)[..., 0]
+    edge = (contact.dist < 0) & (depth[:, 6:].min(-1) < depth[:, :6].min(-1) - 1e-6)
+
+    picked = jnp.stack([jax.nn.one_hot(best // 3, 3), jax.nn.one_hot(best % 3, 3)], 1)  # [C, 2, 3] the edges' axes
+    side = jnp.sign(jnp.einsum("cbji,cj->cbi", mat, normal)) * jnp.array([1.0, -1.0])[:, None]
+    ends = pos + jnp.einsum("cbij,cbj->cbi", mat, side * half * (1 - picked))
+    ways, limits = jnp.einsum("cbij,cbj->cbi", mat, picked), (half * picked).sum(-1)
+    between, cosine = ends[:, 0] - ends[:, 1], (ways[:, 0] * ways[:, 1]).sum(-1)
+    d, e = jnp.einsum("cbi,ci->bc", ways, between)
+    sine = jnp.maximum(1 - cosine**2, 1e-6)
+    shifts = jnp.clip(jnp.stack([cosine * e - d, e - cosine * d], -1) / sine[:, None], -limits, limits)
+    nearest = ends + shifts[..., None] * ways
+    contact = contact.replace(
+        dist=jnp.where(edge, -depth[:, 6:].min(-1), contact.dist),
+        pos=jnp.where(edge[:, None], nearest.mean(1), contact.pos),
+        frame=jnp.where(edge[:, None, None], jax.vmap(math.make_frame)(normal), contact.frame),
+    )
+    return data.replace(_impl=data._impl.replace(contact=contact))
+
+
+def _without_copies(data: mjx.Data) -> mjx.Data:
+    """MJX fills the manifold of a pair up to four points with copies; each would be a spring of its own."""
+    contact = data._impl.contact
+    same = (contact.geom[:, None] == contact.geom).all(-1) & (jnp.abs(contact.pos[:, None] - contact.pos) < 1e-5).all(
+        -1
+    )
+    first = same.argmax(-1) == jnp.arange(len(same))
+    contact = contact.replace(dist=jnp.where(first, contact.dist, 1.0))
+    return data.replace(_impl=data._impl.replace(contact=contact))
 
 
 def _touches(data: mjx.Data) -> jax.Array:
