@@ -148,11 +148,12 @@ def _misbehave(folder: Path, how: str) -> None:
 
 
 def test_processes_that_hang_die_or_raise_cost_only_their_own_task(tmp_path):
+    # The limit holds the start of a process too, which takes a loaded machine some seconds.
     tasks = [(tmp_path / how, how) for how in ("hang", "die", "raise", "refuse", "work", "work2")]
     start = time.monotonic()
-    errors = {task[1]: error for task, error in _pool(_misbehave, tasks, jobs=2, time_limit=15)}
-    assert time.monotonic() - start < 50
-    assert errors["hang"] == "hang: took longer than 15 s; raise --time-limit"
+    errors = {task[1]: error for task, error in _pool(_misbehave, tasks, jobs=2, time_limit=30)}
+    assert time.monotonic() - start < 120
+    assert errors["hang"] == "hang: took longer than 30 s; raise --time-limit"
     assert errors["die"] == "die: the process died (exit code 3)"
     assert str(errors["raise"]).startswith("raise: KeyError: 'x' (test_convert.py:")
     assert errors["refuse"] == "refuse: no"
