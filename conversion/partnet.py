@@ -325,8 +325,8 @@ def read_object(
 ) -> PartNetObject:
     """Read `mobility.urdf` (or `mobility_vhacd.urdf`), its visual meshes and the annotation beside it.
 
-    continuous_range: a joint without limits may move without end. A link may lack up to half of its meshes, which is
-    noted; allow_missing: or any number. textures: visuals get a skin. Raises ObjectError.
+    continuous_range: a joint without limits may move without end. allow_missing: meshes may be missing, which is noted.
+    textures: visuals get a skin. Raises ObjectError.
     """
     reader = _Reader(Path(folder), continuous_range, allow_missing, textures)
     names = ("mobility.urdf", "mobility_vhacd.urdf")
@@ -493,7 +493,7 @@ def _visuals(reader: _Reader, urdf: str, link: yourdfpy.Link) -> Iterator[Visual
         yield Visual(name, vertices, faces, is_handle, file, None if skin is None else skin.of(kept))
     if missing:
         what = f"link {link.name!r}: {len(missing)} of {len(wanted)} meshes missing"
-        if 2 * len(missing) > len(wanted) and not reader.allow_missing:
+        if not reader.allow_missing:
             raise reader.error(f"{what}; restore them or pass --allow-missing", missing[0])
         reader.notes.append(f"{what}, left out: {', '.join(missing[:3])}")
     if empty:
