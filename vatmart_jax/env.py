@@ -222,7 +222,7 @@ class Env:
 
         The rest have any contact, an approach within the cone about the inward normal, any roll. Consumes the key.
         """
-        kc, kg, ka, kr = jax.random.split(key, 4)
+        kc, kg, ka, kr, ks, ko = jax.random.split(key, 6)
         # A guided start weighs promising contacts so much that others are drawn only where a view has none.
         guided = jax.random.uniform(kg, (len(view), 1)) < guided_share
         contact = jax.random.categorical(kc, jnp.where(guided & self._promising[view], 20.0, 0.0), axis=-1)
@@ -231,10 +231,11 @@ class Env:
         if self._grasps is not None:
             straight, across = (x[view, contact] for x in self._grasps)
             aligned = guided & self._promising[view, contact][:, None]
-            up = jnp.where(aligned, g.cone_direction(ka, straight, self.config.grasp_cone), up)
+            up = jnp.where(aligned, g.cone_direction(ks, straight, self.config.grasp_cone), up)
             # The fingers close along the hand's y; either finger may be on either side.
-            side = jnp.where(forward[:, :1] > 0, 1.0, -1.0)
-            off = jnp.tan(0.5 * self.config.grasp_cone) * forward
+            k_side, k_off = jax.random.split(ko)
+            side = jax.random.rademacher(k_side, (len(view), 1), up.dtype)
+            off = jnp.tan(0.5 * self.config.grasp_cone) * jax.random.normal(k_off, up.shape)
             forward = jnp.where(aligned, g.normalize(side * jnp.cross(across, up)) + off, forward)
         return Start(view, contact.astype(jnp.int32), task, g.gripper_frame(up, forward))
 

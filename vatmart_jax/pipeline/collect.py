@@ -55,9 +55,9 @@ class ProposalTrials:
 
     def _sampled_by_view(self, key: jax.Array) -> Start:
         """A batch of starts in which every TASKS_PER_VIEW in a row share a view."""
-        kv, ka = jax.random.split(key)
+        kv, kt, ka = jax.random.split(key, 3)
         view = jnp.repeat(self._env.sample(kv, max(1, self._env.config.batch // TASKS_PER_VIEW)).view, TASKS_PER_VIEW)
-        return self._env.approach(ka, view, self._env.sample_task(kv, view), self._env.config.guided_share)
+        return self._env.approach(ka, view, self._env.sample_task(kt, view), self._env.config.guided_share)
 
     def best(self, params: Params, start: Start, key: jax.Array) -> tuple[EnvState, jax.Array, jax.Array]:
         """The networks' choice for the views and tasks of `start`: final states, trajectories [B, 30], scores [B].

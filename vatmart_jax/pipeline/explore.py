@@ -77,9 +77,10 @@ class Explorer:
             begun = begun.replace(done=jnp.zeros_like(begun.done))
 
         def step(state: EnvState, key: jax.Array):
-            action = self.td3.explore(policy, state.obs, key, noise, random)
+            kp, kx = jax.random.split(key)
+            action = self.td3.explore(policy, state.obs, kp, noise, random)
             shown = expert_action(self.env, state)
-            shown = jnp.clip(shown + noise * jax.random.normal(key, shown.shape), -1, 1)
+            shown = jnp.clip(shown + noise * jax.random.normal(kx, shown.shape), -1, 1)
             action = jnp.where(jnp.arange(len(action))[:, None] < expert * len(action), shown, action)
             after = self.env.step(state, action, abandon)
             record = Episode(
