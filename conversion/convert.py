@@ -38,6 +38,7 @@ from conversion.scenes import scene_bank
 from conversion.textures import read_mtl
 from conversion.views import views
 from vatmart_jax.bank import SceneBank
+from vatmart_jax.files import whole_folder, write_json, write_text
 
 URDF_NAMES = ("mobility.urdf", "mobility_vhacd.urdf")
 TRAIN_CATEGORIES = ("StorageFurniture", "Door", "Microwave", "Refrigerator")  # paper, section 4.1
@@ -135,7 +136,7 @@ def convert(sources: Sequence[Path], out: Path, config: ConvertConfig, jobs: int
         raise ObjectError(failures[0]["reason"] + more)
     banks = _banks(out, current, failures, config, jobs, record.get("banks", {}))
     settings = {"config": asdict(config), "versions": _versions(), "failed": failures, "banks": banks}
-    _write_json(out / "convert.json", settings)
+    write_json(out / "convert.json", settings)
     reasons = [{"id": f["id"], "reason": f["reason"]} for f in failures]
     return ConvertResult(len(current) + len(failed), len(current), reasons, time.monotonic() - start)
 
@@ -246,19 +247,12 @@ def _convert_one(folder: Path, out: Path, config: ConvertConfig, split: str | No
         "merged_scenes": [asdict(s) for s in slots],
         "seconds": round(time.process_time() - start, 3),  # of one core
     }
-    part = out / f".{obj.id}.part"
-    shutil.rmtree(part, ignore_errors=True)
-    try:
-        part.mkdir()
+    with whole_folder(out / obj.id) as part:
         mjcf.write(part)
         converted.save(part)
         bank.save(part / "scenes.npz")
         save_png(part / "picture.png", picture(converted))
-        _write_json(part / "report.json", report)
-        shutil.rmtree(out / obj.id, ignore_errors=True)
-        part.rename(out / obj.id)
-    finally:
-        shutil.rmtree(part, ignore_errors=True)
+        write_json(part / "report.json", report)
 
 
 def _banks(
@@ -283,14 +277,14 @@ def _banks(
     table: dict[str, dict[str, list[str]]] = {split: {} for split in SPLITS}
     for o in objects:
         table[o.split].setdefault(o.obj.category, []).append(o.obj.id)
-    _write_json(out / "splits.json", table)
+    write_json(out / "splits.json", table)
     joined([SceneBank.load(out / name / "scenes.npz") for name in names]).save(out / "scenes.npz")
     links = scene_bank(objects, config.variants, config.collision, config.seed)
     found, without = views(objects, links, config.views, config.points, config.contacts, config.seed, jobs)
     found.save(out / "views.npz")
     without_views = [why for _, why in without]
     reports = [_read_json(out / name / "report.json") for name in names]
-    _write_text(out / "report.html", page(reports, failed, without_views))
+    write_text(out / "report.html", page(reports, failed, without_views))
     pictures = [read_png(out / name / "picture.png") for name in names]
     save_png(out / "contact_sheet.png", contact_sheet(pictures, max(1, round(len(pictures) ** 0.5 / 2))))
     return {"key": key, "without_views": without_views}
@@ -383,13 +377,3 @@ def _read_json(path: Path) -> dict[str, Any]:
     except (OSError, ValueError):
         return {}
     return out if isinstance(out, dict) else {}
-
-
-def _write_json(path: Path, data: Any) -> None:
-    _write_text(path, json.dumps(data, indent=1))
-
-
-def _write_text(path: Path, text: str) -> None:
-    part = path.with_name(path.name + ".part")
-    part.write_text(text)
-    part.replace(path)

@@ -26,6 +26,7 @@ from trimesh.ray.ray_pyembree import RayMeshIntersector
 
 from conversion.textures import Material, Skin, read_mtl, read_png
 from vatmart_jax.errors import UserError
+from vatmart_jax.files import whole
 
 MAX_COORDINATE = 1e3  # objects are normalised to about 2 unit lengths; anything near this is damage
 MAX_FILE_BYTES = 256 * 2**20
@@ -194,9 +195,7 @@ class ConvertedObject:
         faces, face_start = _pack([v.faces for _, v in visuals])
         hull_vertices, hull_start = _pack([h.vertices for _, h in hulls])
         boxes = [h for _, h in hulls if h.box_size is not None]
-        path = folder / "object.npz"
-        part = path.with_name(path.name + ".part")
-        with part.open("wb") as f:
+        with whole(folder / "object.npz") as part, part.open("wb") as f:
             np.savez(
                 f,
                 text=np.array(json.dumps(text)),
@@ -212,7 +211,6 @@ class ConvertedObject:
                 box_pose=np.array([h.box_pose for h in boxes]).reshape(-1, 4, 4),
                 box_size=np.array([h.box_size for h in boxes]).reshape(-1, 3),
             )
-        part.replace(path)
 
     @classmethod
     def load(cls, folder: Path) -> ConvertedObject:

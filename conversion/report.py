@@ -15,6 +15,7 @@ from scipy.spatial import ConvexHull
 from trimesh.ray.ray_pyembree import RayMeshIntersector
 
 from conversion.partnet import ConvertedObject, PartNetObject
+from vatmart_jax.files import whole
 
 _LIGHT = np.array([-0.5, 0.35, 0.8]) / np.linalg.norm([-0.5, 0.35, 0.8])
 _PALETTE = np.array(
@@ -51,9 +52,8 @@ def contact_sheet(pictures: Sequence[np.ndarray], columns: int) -> np.ndarray:
 
 def save_png(path: Path, image: np.ndarray) -> None:
     """Complete or not at all."""
-    part = path.with_name(path.name + ".part")
-    image_file.imsave(part, image, format="png")
-    part.replace(path)
+    with whole(path) as part:
+        image_file.imsave(part, image, format="png")
 
 
 def read_png(path: Path) -> np.ndarray:

@@ -16,10 +16,10 @@ from vatmart_jax.data import Data
 from vatmart_jax.env import TASKS, Env, EnvConfig
 from vatmart_jax.evaluation.metrics import wilson_interval
 from vatmart_jax.expert import expert_action, expert_start
+from vatmart_jax.files import write_json
 from vatmart_jax.geometry import WAYPOINTS
 from vatmart_jax.physics import PhysicsConfig
 from vatmart_jax.physics.template import FINGER_OPEN, FINGERS
-from vatmart_jax.pipeline.run import write_json
 
 
 @dataclass(frozen=True)

@@ -24,6 +24,7 @@ from vatmart_jax.bank import SceneBank, ViewBank
 from vatmart_jax.bench import device, random_trials, valid_starts
 from vatmart_jax.env import TASKS, Env, EnvConfig, EnvState, Start
 from vatmart_jax.expert import run_expert
+from vatmart_jax.files import write_json
 from vatmart_jax.physics import PhysicsConfig
 from vatmart_jax.physics.controller import waypoint_controls
 from vatmart_jax.physics.template import HAND, N_CTRL, PART, scene_model
@@ -177,7 +178,7 @@ def main(args: Study) -> None:
         result[name] = study(args, name, bank, views)
         print(name, json.dumps(result[name], indent=2))
     result["seconds"] = round(time.monotonic() - begun, 1)
-    args.out.write_text(json.dumps(result, indent=2) + "\n")
+    write_json(args.out, result)
 
 
 if __name__ == "__main__":

@@ -18,8 +18,8 @@ import tyro
 
 from vatmart_jax.bank import SceneBank, ViewBank
 from vatmart_jax.env import ACTION, TASKS, Env, EnvConfig
+from vatmart_jax.files import write_json
 from vatmart_jax.geometry import WAYPOINTS
-from vatmart_jax.pipeline.run import write_json
 
 
 @dataclass(frozen=True)

@@ -7,9 +7,6 @@ a seed depends on the seed and i alone.
 from __future__ import annotations
 
 import json
-import os
-import shutil
-import tempfile
 from collections.abc import Callable
 from pathlib import Path
 from xml.sax.saxutils import quoteattr
@@ -33,6 +30,7 @@ from mjcf_assets.solids import (
     tub,
 )  # fmt: skip
 from vatmart_jax.errors import UserError
+from vatmart_jax.files import whole_folder, write_text
 
 # The order in which categories come: each of them early, and in proportions like those of the real set.
 CYCLE = (
@@ -70,7 +68,7 @@ def generate(out: Path, count: int, seed: int) -> list[str]:
         splits[split].setdefault(category, []).append(name)
         rng = np.random.default_rng([seed, i])
         _write(out / name, category, MAKERS[category](rng), rng)
-    _write_text(out / "splits.json", json.dumps(splits))
+    write_text(out / "splits.json", json.dumps(splits))
     return ids
 
 
@@ -653,9 +651,8 @@ def _write(folder: Path, category: str, links: list[Link], rng: np.random.Genera
         np.zeros(3) if link.joint is None or not link.joint.origin.any() else scale * (link.joint.origin - centre)
         for link in links
     ]
-    temporary = Path(tempfile.mkdtemp(dir=folder.parent, prefix=f".{folder.name}."))
-    try:
-        (temporary / "textured_objs").mkdir()
+    with whole_folder(folder) as part:
+        (part / "textured_objs").mkdir()
         urdf, semantics, mobility = [], [], []
         objs = parts = 0
         for i, link in enumerate(links):
@@ -669,7 +666,7 @@ def _write(folder: Path, category: str, links: list[Link], rng: np.random.Genera
                     objs += 1
                     file = f"textured_objs/original-{objs}.obj"
                     text = _obj(f"{name}-{objs}", scale * (mesh.vertices - centre), mesh.faces)
-                    (temporary / file).write_text(text)
+                    (part / file).write_text(text)
                     visuals.append((f"{name}-{parts}", file))
             semantics.append(f"link_{i} {link.kind}")
             urdf += _link(i, visuals, -origin[i]) + _joint(i, link, parent, origin[i] - base, scale)
@@ -677,31 +674,19 @@ def _write(folder: Path, category: str, links: list[Link], rng: np.random.Genera
                 "id": i, "parent": parent, "joint": link.kind.split()[0], "name": link.name, "parts": names,
                 "jointData": _joint_data(link, origin[i], scale),
             })  # fmt: skip
-        (temporary / "mobility.urdf").write_text(
+        (part / "mobility.urdf").write_text(
             "\n".join(
                 ['<?xml version="1.0" ?>', f'<robot name="partnet_{folder.name}">', '\t<link name="base"/>', *urdf]
             )
             + "\n</robot>\n"
         )
-        (temporary / "semantics.txt").write_text("\n".join(semantics) + "\n")
-        (temporary / "mobility_v2.json").write_text(json.dumps(mobility))
+        (part / "semantics.txt").write_text("\n".join(semantics) + "\n")
+        (part / "mobility_v2.json").write_text(json.dumps(mobility))
         meta = {"model_id": folder.name, "anno_id": folder.name, "user_id": "procedural", "time_in_sec": "0",
                 "version": "1", "model_cat": category}  # fmt: skip
-        (temporary / "meta.json").write_text(json.dumps(meta))
+        (part / "meta.json").write_text(json.dumps(meta))
         box_ = {"min": (scale * (lo - centre)).round(6).tolist(), "max": (scale * (hi - centre)).round(6).tolist()}
-        (temporary / "bounding_box.json").write_text(json.dumps(box_))
-        temporary.chmod(0o755)
-        if folder.exists():
-            shutil.rmtree(folder)
-        temporary.rename(folder)
-    finally:
-        shutil.rmtree(temporary, ignore_errors=True)
-
-
-def _write_text(path: Path, text: str) -> None:
-    part = path.with_name(path.name + ".part")
-    part.write_text(text)
-    os.replace(part, path)
+        (part / "bounding_box.json").write_text(json.dumps(box_))
 
 
 def _obj(name: str, vertices: np.ndarray, faces: np.ndarray) -> str:

@@ -21,6 +21,7 @@ import numpy as np
 from flax import struct
 
 from vatmart_jax.errors import UserError
+from vatmart_jax.files import whole
 
 HINGE, SLIDE = 0, 1
 FORMAT = 1
@@ -184,14 +185,8 @@ class Scenes:
 
 
 def _save(path: Path | str, kind: str, arrays: dict[str, np.ndarray | str]) -> None:
-    path = Path(path)
-    part = path.with_name(path.name + ".part")
-    try:
-        with part.open("wb") as f:
-            np.savez(f, **{"format": np.int32(FORMAT), "kind": np.array(kind), **arrays})  # pyright: ignore[reportArgumentType]
-        part.replace(path)
-    finally:
-        part.unlink(missing_ok=True)
+    with whole(path) as part, part.open("wb") as f:
+        np.savez(f, **{"format": np.int32(FORMAT), "kind": np.array(kind), **arrays})  # pyright: ignore[reportArgumentType]
 
 
 def _load(path: Path | str, kind: str, names: list[str]) -> dict:

@@ -16,6 +16,7 @@ from tyro.conf import Positional, arg
 
 from vatmart_jax import __version__
 from vatmart_jax.errors import OpenGLError, UserError
+from vatmart_jax.files import whole_folder, write_json
 
 _Json = Annotated[bool, arg(help="print one JSON object as the last line of standard output")]
 
@@ -273,7 +274,7 @@ def _bench(argv: list[str]) -> None:
         folders = [_prepared(data, bars.say) for data in args.data or (None,)]
         result = args.run(Choice(folders[0], args.split, args.objects), folders[1:], bars.say)
     if args.out:
-        args.out.write_text(json.dumps(result, indent=1) + "\n")
+        write_json(args.out, result)
     _print_result(result, args.json)
 
 
@@ -460,9 +461,8 @@ def _prepared(data: Path | None, say: Callable[[str], None], points: int = 0) ->
     def make(out: Path) -> None:
         if not out.is_dir():
             say(f"making {BUNDLED_COUNT} bundled objects")
-            part = out.with_name(out.name + ".part")
-            generate(part, BUNDLED_COUNT, BUNDLED_SEED)
-            part.rename(out)
+            with whole_folder(out) as part:
+                generate(part, BUNDLED_COUNT, BUNDLED_SEED)
 
     return prepare(data, convert_into, make)
 

@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import json
-import shutil
-import uuid
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -14,6 +11,7 @@ from jax import export as jax_export
 
 from vatmart_jax.config import to_json
 from vatmart_jax.errors import UserError
+from vatmart_jax.files import whole_folder, write_json
 from vatmart_jax.inference import Priors, predict
 
 FORMATS = ("flax", "stablehlo")
@@ -35,7 +33,6 @@ def export(priors: Priors, out: Path | str, formats: Sequence[str] = FORMATS, n_
     if unknown or not formats:
         raise ExportError(f"--format {','.join(unknown)}: not one of {', '.join(FORMATS)}")
     out = Path(out)
-    out.mkdir(parents=True, exist_ok=True)
     for name in formats:
         if name == "flax":
             priors.save(out / "flax")
@@ -61,12 +58,6 @@ def _save_stablehlo(priors: Priors, folder: Path, n_proposals: int) -> None:
     outputs = dict(zip(names, exported.out_avals, strict=True))
     describe = lambda of: {k: {"shape": list(v.shape), "dtype": v.dtype.name} for k, v in of.items()}  # noqa: E731
     signature = {"inputs": describe(inputs), "outputs": describe(outputs), "platforms": list(PLATFORMS)}
-    part = folder.with_name(f"{folder.name}.{uuid.uuid4().hex[:8]}.part")
-    try:
-        part.mkdir()
+    with whole_folder(folder) as part:
         (part / "priors.bin").write_bytes(exported.serialize())
-        (part / "signature.json").write_text(json.dumps(signature | to_json(priors.config), indent=2) + "\n")
-        shutil.rmtree(folder, ignore_errors=True)
-        part.replace(folder)
-    finally:
-        shutil.rmtree(part, ignore_errors=True)
+        write_json(part / "signature.json", signature | to_json(priors.config))

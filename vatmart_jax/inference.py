@@ -10,8 +10,6 @@ from __future__ import annotations
 
 import json
 import math
-import shutil
-import uuid
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -25,6 +23,7 @@ from flax import serialization
 
 from vatmart_jax.config import from_json, to_json
 from vatmart_jax.errors import UserError
+from vatmart_jax.files import whole, whole_folder, write_json
 from vatmart_jax.perception.networks import Features, Networks, NetworksConfig, Params
 from vatmart_jax.perception.pointnet2 import group
 
@@ -59,14 +58,8 @@ class Prediction(NamedTuple):
 
     def save(self, path: Path | str) -> None:
         """Write one .npz file with these fields, complete or not at all."""
-        path = Path(path)
-        part = path.with_name(path.name + ".part")
-        try:
-            with part.open("wb") as f:
-                np.savez(f, **self._asdict())
-            part.replace(path)
-        finally:
-            part.unlink(missing_ok=True)
+        with whole(path) as part, part.open("wb") as f:
+            np.savez(f, **self._asdict())
 
 
 @dataclass(frozen=True)
@@ -82,20 +75,9 @@ class Priors:
 
     def save(self, path: Path | str) -> None:
         """Write the folder, complete or not at all; one that is there is replaced."""
-        path = Path(path)
-        path.parent.mkdir(parents=True, exist_ok=True)
-        tag = uuid.uuid4().hex[:8]
-        part, old = path.with_name(f"{path.name}.{tag}.part"), path.with_name(f"{path.name}.{tag}.old")
-        try:
-            part.mkdir()
+        with whole_folder(path) as part:
             (part / "params.msgpack").write_bytes(serialization.msgpack_serialize(jax.device_get(self.params)))
-            (part / "config.json").write_text(json.dumps({"format": FORMAT, **to_json(self.config)}, indent=2) + "\n")
-            if path.exists():
-                path.replace(old)
-            part.replace(path)
-        finally:
-            shutil.rmtree(part, ignore_errors=True)
-            shutil.rmtree(old, ignore_errors=True)
+            write_json(part / "config.json", {"format": FORMAT, **to_json(self.config)})
 
     @classmethod
     def load(cls, path: Path | str) -> Priors:

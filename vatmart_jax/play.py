@@ -21,6 +21,7 @@ from vatmart_jax.bank import HINGE, SceneBank, ViewBank
 from vatmart_jax.env import TASKS, Env, EnvConfig, EnvState, Start, Task
 from vatmart_jax.errors import OpenGLError, UserError
 from vatmart_jax.expert import run_expert
+from vatmart_jax.files import whole
 from vatmart_jax.inference import Priors
 from vatmart_jax.physics import Physics, PhysicsState
 from vatmart_jax.physics.template import scene_model
@@ -190,14 +191,10 @@ def animate(recording: Recording, path: Path, size: tuple[int, int] = SIZE) -> N
     from PIL import Image
 
     images = [Image.fromarray(pixels).quantize(96) for pixels in _rendered(recording, size)]
-    part = path.with_name(path.name + ".part")
-    try:
+    with whole(path) as part:
         images[0].save(
             part, format="GIF", save_all=True, append_images=images[1:], duration=FRAME_MS, loop=0, optimize=True
         )
-        part.replace(path)
-    finally:
-        part.unlink(missing_ok=True)
 
 
 def show(recording: Recording) -> None:

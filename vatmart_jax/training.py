@@ -17,10 +17,11 @@ from vatmart_jax.data import SPLITS, Data, DataError
 from vatmart_jax.env import TASKS, Env, Task
 from vatmart_jax.errors import UserError
 from vatmart_jax.evaluation.evaluate import evaluate_split, markdown
+from vatmart_jax.files import write_bytes, write_json
 from vatmart_jax.inference import Priors, PriorsConfig
 from vatmart_jax.physics.interface import IMPLS
 from vatmart_jax.pipeline import pictures
-from vatmart_jax.pipeline.run import Run, write_bytes, write_json
+from vatmart_jax.pipeline.run import Run
 from vatmart_jax.pipeline.train import Report, Training, run_seconds
 from vatmart_jax.presets import Settings
 

@@ -18,12 +18,13 @@ from vatmart_jax.errors import UserError
 from vatmart_jax.evaluation.downstream import Method, downstream, random_method
 from vatmart_jax.evaluation.priors import labelled, priors_metrics
 from vatmart_jax.expert import run_expert
+from vatmart_jax.files import write_json, write_text
 from vatmart_jax.inference import Priors
 from vatmart_jax.perception.train import clouds_of
 from vatmart_jax.physics.interface import IMPLS
 from vatmart_jax.pipeline.collect import ProposalTrials
 from vatmart_jax.pipeline.explore import Explorer
-from vatmart_jax.pipeline.run import read_config, write_json, write_text
+from vatmart_jax.pipeline.run import read_config
 from vatmart_jax.presets import Settings
 
 METHODS = ("ours", "random", "expert")

@@ -10,6 +10,7 @@ import matplotlib
 import numpy as np
 
 from vatmart_jax import geometry as g
+from vatmart_jax.files import whole
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
@@ -128,10 +129,8 @@ def _camera(azimuth: float, elevation: float) -> tuple[np.ndarray, np.ndarray, n
 
 
 def _save(figure, out: Path) -> None:
-    part = out.with_name(out.name + ".part")
     try:
-        figure.savefig(part, dpi=110, bbox_inches="tight", format="png")
-        part.replace(out)
+        with whole(out) as part:
+            figure.savefig(part, dpi=110, bbox_inches="tight", format="png")
     finally:
         plt.close(figure)
-        part.unlink(missing_ok=True)

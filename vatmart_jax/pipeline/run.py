@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import time
 from pathlib import Path
 from typing import Any
@@ -13,6 +12,7 @@ import jax.numpy as jnp
 import orbax.checkpoint as ocp
 
 from vatmart_jax.errors import UserError
+from vatmart_jax.files import write_json, write_text
 
 
 class RunError(UserError):
@@ -105,26 +105,6 @@ def check_folder(folder: Path, config: dict[str, Any]) -> None:
             )
     elif folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
         raise RunError(f"{folder}: is not an empty folder and holds no run (no config.json); choose another --out")
-
-
-def write_bytes(path: Path, content: bytes) -> None:
-    """Write a file, complete or not at all."""
-    part = path.with_name(path.name + ".part")
-    try:
-        part.write_bytes(content)
-        os.replace(part, path)
-    finally:
-        part.unlink(missing_ok=True)
-
-
-def write_text(path: Path, text: str) -> None:
-    """Write a file, complete or not at all."""
-    write_bytes(path, text.encode())
-
-
-def write_json(path: Path, value: Any) -> None:
-    """Write JSON, complete or not at all."""
-    write_text(path, json.dumps(value, indent=2) + "\n")
 
 
 def _read_json(path: Path) -> dict[str, Any]:
