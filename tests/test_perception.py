@@ -143,19 +143,21 @@ def test_batches_hold_true_labels_and_only_filled_rows(world, data) -> None:
         assert (batch.probe_task >= CONFIG.low).all() and (batch.which < clouds.contacts.shape[1]).all()
 
 
-def test_mirrored_and_turned_scenes_have_mirrored_and_turned_motions(world, data) -> None:
+def test_mirrored_turned_and_scaled_scenes_have_motions_to_match(world, data) -> None:
     clouds, _ = world
     index = t._index(data, len(clouds))
     batch = t._draw(jax.random.key(0), clouds, data, index, replace(CONFIG, mirror=False))
     one = jax.tree.map(lambda a: a[0], batch)
     for mirrored in (False, True):
-        found = t.transformed(one, jnp.array(mirrored), jnp.float32(0.7))
+        found = t.transformed(one, jnp.array(mirrored), jnp.float32(0.7), jnp.float32(1.2), task_is_length=mirrored)
         turn = g.matrix_from_rotvec(jnp.array([0.0, 0.0, 0.7]))
         whole = turn @ jnp.diag(jnp.array([1.0, -1.0 if mirrored else 1.0, 1.0]))
-        np.testing.assert_allclose(found.points, one.points @ whole.T, atol=1e-5)
-        np.testing.assert_allclose(found.grouping.queries, one.grouping.queries @ whole.T, atol=1e-5)
+        np.testing.assert_allclose(found.points, 1.2 * one.points @ whole.T, atol=1e-5)
+        np.testing.assert_allclose(found.grouping.queries, 1.2 * one.grouping.queries @ whole.T, atol=1e-5)
+        for name in ("task", "achieved", "probe_task"):
+            np.testing.assert_allclose(getattr(found, name), getattr(one, name) * (1.2 if mirrored else 1), rtol=1e-6)
         (start, steps), (start0, steps0) = g.unpack_trajectory(found.trajectory), g.unpack_trajectory(one.trajectory)
-        np.testing.assert_allclose(steps[..., :3], steps0[..., :3] @ whole.T, atol=1e-5)
+        np.testing.assert_allclose(steps[..., :3], 1.2 * steps0[..., :3] @ whole.T, atol=1e-5)
         hand = start[:, None] @ g.matrix_from_euler(steps[..., 3:])
         hand0 = start0[:, None] @ g.matrix_from_euler(steps0[..., 3:])
         # The hand is its own mirror image, left for right.

@@ -102,6 +102,10 @@ class PerceptionConfig:
     """augmentation: views turn about the vertical by up to this much (rad), either way"""
     mirror: bool = True
     """augmentation: half of the views are mirrored left to right"""
+    scale: float = 0.0
+    """augmentation: views, and what happens in them, grow or shrink by up to this share"""
+    task_is_length: bool = False
+    """tasks grow with the view (drawers)"""
     learning_rate: float = 1e-3
     """after 100 steps of warm-up; falls along a cosine to a fiftieth at the stage's end"""
     weight_decay: float = 1e-4
@@ -116,6 +120,8 @@ class PerceptionConfig:
     """of the squared 6D distance of start rotations"""
     kl_weight: float = 1.0
     """of the KL divergence; at 0.05 the decoder's samples ignore contact and task"""
+    kl_free: float = 0.0
+    """nats of it that cost nothing, so that the posterior does not collapse before the decoder has learned to listen"""
     actionability_weight: float = 5.0
     """of the L1 of actionability"""
     steps_per_call: int = 50
@@ -416,26 +422,40 @@ _MIRROR_TRAJECTORY = np.concatenate([_MIRROR, _MIRROR, np.tile(np.concatenate([_
 
 
 def _augmented(key: jax.Array, config: PerceptionConfig, batch: Batch) -> Batch:
-    """Whole scenes mirrored and turned about the vertical: the physics is the same. Consumes the key."""
-    k_mirror, k_yaw = jax.random.split(key)
+    """Whole scenes mirrored, turned about the vertical and scaled. Consumes the key.
+
+    Mirrored and turned scenes are exact; a scaled one takes the gripper's size along, which is small beside it.
+    """
+    k_mirror, k_yaw, k_scale = jax.random.split(key, 3)
     views = batch.points.shape[:1]
     mirrored = jax.random.bernoulli(k_mirror, 0.5, views) & config.mirror
     yaw = jax.random.uniform(k_yaw, views, minval=-config.yaw, maxval=config.yaw)
-    return jax.vmap(transformed)(batch, mirrored, yaw)
+    limit = float(np.log1p(config.scale))
+    scale = jnp.exp(jax.random.uniform(k_scale, views, minval=-limit, maxval=limit))
+    return jax.vmap(partial(transformed, task_is_length=config.task_is_length))(batch, mirrored, yaw, scale)
 
 
-def transformed(batch: Batch, mirrored: jax.Array, yaw: jax.Array) -> Batch:
-    """One view of a Batch, mirrored left to right where `mirrored` [] bool, then turned by `yaw` [] rad about z."""
+def transformed(
+    batch: Batch, mirrored: jax.Array, yaw: jax.Array, scale: jax.Array, task_is_length: bool = False
+) -> Batch:
+    """One view of a Batch, mirrored left to right where `mirrored` [] bool, then turned by `yaw` [] rad about z, then
+    `scale` [] times as large about the origin."""
     cos, sin = jnp.cos(yaw), jnp.sin(yaw)
     turn = jnp.array([[cos, sin, 0], [-sin, cos, 0], [0, 0, 1]])  # of row vectors
     of_vectors = lambda v: jnp.where(mirrored, v * _MIRROR, v) @ turn  # noqa: E731
     trajectory = jnp.where(mirrored, batch.trajectory * _MIRROR_TRAJECTORY, batch.trajectory)
     triples = trajectory.reshape(-1, trajectory.shape[-1] // 3, 3)
-    is_euler = (jnp.arange(triples.shape[1]) >= 3) & (jnp.arange(triples.shape[1]) % 2 == 1)
+    number = jnp.arange(triples.shape[1])[:, None]  # two of the start rotation, then a move and Euler angles by turns
+    is_euler, is_move = (number >= 3) & (number % 2 == 1), (number >= 2) & (number % 2 == 0)
+    triples = jnp.where(is_euler, triples, triples @ turn) * jnp.where(is_move, scale, 1.0)
+    of_tasks = lambda t: t * scale if task_is_length else t  # noqa: E731
     return batch._replace(
-        points=of_vectors(batch.points),
-        grouping=replace(batch.grouping, queries=of_vectors(batch.grouping.queries)),
-        trajectory=jnp.where(is_euler[:, None], triples, triples @ turn).reshape(trajectory.shape),
+        points=of_vectors(batch.points) * scale,
+        grouping=replace(batch.grouping, queries=of_vectors(batch.grouping.queries) * scale),
+        trajectory=triples.reshape(trajectory.shape),
+        task=of_tasks(batch.task),
+        achieved=of_tasks(batch.achieved),
+        probe_task=of_tasks(batch.probe_task),
     )
 
 
@@ -464,7 +484,7 @@ def _loss(
         move, turn, rotation = losses.reconstruction_losses(decoded, batch.trajectory, batch.weight)
         kl = losses.kl_loss(mean, log_variance, batch.weight)
         total += config.move_weight * move + config.turn_weight * turn
-        total += config.rotation_weight * rotation + config.kl_weight * kl
+        total += config.rotation_weight * rotation + config.kl_weight * jnp.maximum(kl, config.kl_free)
         metrics |= {"move_loss": move, "turn_loss": turn, "rotation_loss": rotation, "kl_loss": kl}
     if "actionability" in heads:
         where = (contact[:, n:], batch.probe_task)

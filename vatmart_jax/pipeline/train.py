@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from flax import struct
 
+from vatmart_jax.bank import SLIDE
 from vatmart_jax.env import Env, Start, Task
 from vatmart_jax.errors import UserError
 from vatmart_jax.perception import train as perception
@@ -221,8 +222,9 @@ class Training:
 def perception_config(settings: Settings, task: Task) -> PerceptionConfig:
     """The settings' perception config with the task's limits in it."""
     return replace(
-        settings.perception, low=task.low, high=task.high, tolerance=settings.env.tolerance, shift=task.shift
-    )
+        settings.perception, low=task.low, high=task.high, tolerance=settings.env.tolerance, shift=task.shift,
+        task_is_length=task.joint_type == SLIDE,
+    )  # fmt: skip
 
 
 def hash_of(text: str) -> int:
