@@ -11,7 +11,8 @@ from flax import serialization
 from jax import export as jax_export
 
 from vatmart_jax.cli import main
-from vatmart_jax.export import ExportError, export
+from vatmart_jax.errors import UserError
+from vatmart_jax.export import export
 from vatmart_jax.inference import Priors, PriorsConfig, PriorsError, amount, read_cloud, read_mask
 from vatmart_jax.perception.networks import Networks, NetworksConfig
 from vatmart_jax.perception.pointnet2 import Level, PointNetConfig
@@ -156,7 +157,7 @@ def test_exported_stablehlo_computes_what_the_priors_do(priors: Priors, points: 
 
 
 def test_an_unknown_export_format_writes_nothing(priors: Priors, tmp_path: Path) -> None:
-    with pytest.raises(ExportError, match="--format onnx: not one of flax, stablehlo"):
+    with pytest.raises(UserError, match="--format onnx: not one of flax, stablehlo"):
         export(priors, tmp_path / "out", ("flax", "onnx"))
     assert not (tmp_path / "out").exists()
 

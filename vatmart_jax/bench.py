@@ -11,7 +11,7 @@ import platform
 import resource
 import sys
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
 from functools import partial
@@ -24,7 +24,7 @@ import numpy as np
 
 from vatmart_jax.bank import SceneBank, ViewBank
 from vatmart_jax.env import TASKS, Env, EnvConfig, EnvState, Start
-from vatmart_jax.errors import UserError
+from vatmart_jax.errors import UserError, one_of
 from vatmart_jax.expert import expert_action
 from vatmart_jax.geometry import TRAJECTORY, WAYPOINTS
 from vatmart_jax.perception import train as perception
@@ -69,8 +69,8 @@ def bench_physics(
     Each measurement lasts at least `seconds`. Of several batch sizes each runs in a process of its own, for peaks of
     memory would add up; the result is the first one's, and all are its `runs`.
     """
-    _check("--task", (task,), TASKS)
-    _check("--impl", (impl,), IMPLS)
+    one_of("--task", task, TASKS)
+    one_of("--impl", impl, IMPLS)
     if min(batches) < 1:
         raise UserError(f"--batch {min(batches)}: a batch has one simulation or more")
     if len(batches) == 1:
@@ -134,7 +134,8 @@ def bench_parity(
     What is compared is how far the part moved and whether that is a success, over starts that are valid on the first.
     With a twin, another conversion of the same objects (boxes for hulls), the first implementation runs on that too.
     """
-    _check("--impls", impls, IMPLS)
+    for impl in impls:
+        one_of("--impls", impl, IMPLS)
     bank, views = choice.banks(seed)
     variants = {impl: (impl, bank) for impl in impls}
     if twin is not None:
@@ -191,7 +192,7 @@ def bench_parity(
 
 def bench_perception(choice: Choice, preset: str, seed: int, seconds: float) -> dict[str, Any]:
     """Training steps per second of each stage, and how long one view of 10,000 points takes to group and to encode."""
-    _check("--preset", (preset,), PRESETS)
+    one_of("--preset", preset, PRESETS)
     config = replace(PRESETS[preset].perception, steps_per_call=5)
     networks, pointnet = Networks(config.networks), config.networks.pointnet
     rng = np.random.default_rng(seed)
@@ -274,12 +275,6 @@ def device() -> str:
     rows = info.read_text().splitlines() if info.exists() else []
     names = [row.split(":", 1)[1].strip() for row in rows if row.startswith("model name")]
     return f"{names[0] if names else platform.machine()}, {os.cpu_count()} cores"
-
-
-def _check(flag: str, names: Iterable[str], known: Iterable[str]) -> None:
-    for name in names:
-        if name not in known:
-            raise UserError(f"{flag} {name}: not one of {', '.join(known)}")
 
 
 @dataclass(frozen=True)

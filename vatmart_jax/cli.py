@@ -15,7 +15,7 @@ import tyro
 from tyro.conf import Positional, arg
 
 from vatmart_jax import __version__
-from vatmart_jax.errors import OpenGLError, UserError
+from vatmart_jax.errors import OpenGLError, UserError, one_of
 from vatmart_jax.files import whole_folder, write_json
 
 _Json = Annotated[bool, arg(help="print one JSON object as the last line of standard output")]
@@ -109,8 +109,7 @@ def _train(argv: list[str]) -> None:
     from vatmart_jax.presets import PRESETS, Settings
 
     chosen = _peek(argv, "--preset") or "quick"
-    if chosen not in PRESETS:
-        raise UserError(f"--preset {chosen}: not one of {', '.join(PRESETS)}")
+    one_of("--preset", chosen, PRESETS)
 
     @dataclass(frozen=True)
     class Train:

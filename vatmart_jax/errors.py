@@ -1,8 +1,16 @@
 """Errors that a user can mend."""
 
+from collections.abc import Iterable
+
 
 class UserError(ValueError):
     """Bad input. The message is one line that names the file, link or flag, what was expected, and the remedy."""
+
+
+def one_of(flag: str, value: str, known: Iterable[str]) -> None:
+    """Raises UserError unless the flag's value is one of the known ones."""
+    if value not in known:
+        raise UserError(f"{flag} {value}: not one of {', '.join(known)}")
 
 
 class OpenGLError(UserError):

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from jax import export as jax_export
 
 from vatmart_jax.config import to_json
-from vatmart_jax.errors import UserError
+from vatmart_jax.errors import one_of
 from vatmart_jax.files import whole_folder, write_json
 from vatmart_jax.inference import Priors, predict
 
@@ -18,20 +18,15 @@ FORMATS = ("flax", "stablehlo")
 PLATFORMS = ("cpu", "cuda")
 
 
-class ExportError(UserError):
-    """A format that does not exist was asked for."""
-
-
 def export(priors: Priors, out: Path | str, formats: Sequence[str] = FORMATS, n_proposals: int = 100) -> list[Path]:
     """Write the priors into folder `out`, one subfolder per format; returns the files.
 
     `flax/` loads with `Priors.load`. `stablehlo/priors.bin` loads with `jax.export.deserialize` (any StableHLO runtime
     for the module within) and is one function, parameters included; `stablehlo/signature.json` names what goes in and
-    comes out. Raises ExportError for an unknown format, before anything is written.
+    comes out. Raises UserError for an unknown format, before anything is written.
     """
-    unknown = [name for name in formats if name not in FORMATS]
-    if unknown or not formats:
-        raise ExportError(f"--format {','.join(unknown)}: not one of {', '.join(FORMATS)}")
+    for name in formats:
+        one_of("--format", name, FORMATS)
     out = Path(out)
     for name in formats:
         if name == "flax":

@@ -19,7 +19,7 @@ from jax.experimental import io_callback
 from vatmart_jax import geometry as g
 from vatmart_jax.bank import HINGE, SceneBank, ViewBank
 from vatmart_jax.env import TASKS, Env, EnvConfig, EnvState, Start, Task
-from vatmart_jax.errors import OpenGLError, UserError
+from vatmart_jax.errors import OpenGLError, UserError, one_of
 from vatmart_jax.expert import run_expert
 from vatmart_jax.files import whole
 from vatmart_jax.inference import Priors
@@ -85,8 +85,7 @@ def play(
     kind = "door" if bank.joint_type[chosen[0]] == HINGE else "drawer"
     priors = Priors.load(run / "priors") if run else None
     name = task or (priors.config.task if priors else f"push-{kind}")
-    if name not in TASKS:
-        raise UserError(f"--task {name}: not one of {', '.join(TASKS)}")
+    one_of("--task", name, TASKS)
     env = Env(bank.select(chosen), views.of_scenes(chosen), TASKS[name], "c", EnvConfig(batch=TRIES))
     start = jax.jit(lambda key: env.sample(key, TRIES))(jax.random.key(seed))
     if amount is not None:

@@ -15,7 +15,7 @@ from vatmart_jax import __version__
 from vatmart_jax.config import to_json
 from vatmart_jax.data import SPLITS, Data, DataError
 from vatmart_jax.env import TASKS, Env, Task
-from vatmart_jax.errors import UserError
+from vatmart_jax.errors import one_of
 from vatmart_jax.evaluation.evaluate import evaluate_split, markdown
 from vatmart_jax.files import write_bytes, write_json
 from vatmart_jax.inference import Priors, PriorsConfig
@@ -30,11 +30,9 @@ _PICTURES = 6
 
 def resolve(task: str, preset: str, impl: str, seed: int, settings: Settings, data: Path | None) -> dict[str, Any]:
     """The config that is written beside every result. Raises UserError for an unknown task or impl."""
-    if task not in TASKS:
-        raise UserError(f"--task {task}: not one of {', '.join(TASKS)}")
-    if impl not in IMPLS:
-        raise UserError(f"--impl {impl}: not one of {', '.join(IMPLS)}")
-    config = {
+    one_of("--task", task, TASKS)
+    one_of("--impl", impl, IMPLS)
+    return {
         "version": __version__,
         "task": task,
         "data": None if data is None else str(data.resolve()),
@@ -43,7 +41,6 @@ def resolve(task: str, preset: str, impl: str, seed: int, settings: Settings, da
         "seed": seed,
         "settings": to_json(settings),
     }
-    return config
 
 
 def train(

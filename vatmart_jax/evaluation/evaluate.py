@@ -14,7 +14,7 @@ from flax import serialization
 from vatmart_jax.config import from_json
 from vatmart_jax.data import SPLITS, Data, DataError
 from vatmart_jax.env import TASKS, Env
-from vatmart_jax.errors import UserError
+from vatmart_jax.errors import UserError, one_of
 from vatmart_jax.evaluation.downstream import Method, downstream, random_method
 from vatmart_jax.evaluation.priors import labelled, priors_metrics
 from vatmart_jax.expert import run_expert
@@ -51,12 +51,10 @@ def evaluate(
     prepared: the converted folder of a --data; data: overrides what a run was trained on. Writes evaluation.json and
     evaluation.md into `out`, or into each run's folder. Raises UserError for what cannot be evaluated.
     """
-    for given, known, flag in ((metrics, METRICS, "--metrics"), (methods, METHODS, "--methods")):
+    for flag, given, known in (("--metrics", metrics, METRICS), ("--methods", methods, METHODS)):
         for name in given:
-            if name not in known:
-                raise UserError(f"{flag} {name}: not one of {', '.join(known)}")
-    if impl not in IMPLS:
-        raise UserError(f"--impl {impl}: not one of {', '.join(IMPLS)}")
+            one_of(flag, name, known)
+    one_of("--impl", impl, IMPLS)
     if trials < 1:
         raise UserError(f"--trials {trials}: must be at least 1")
     begun = time.monotonic()
