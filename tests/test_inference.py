@@ -36,7 +36,7 @@ def test_loaded_priors_predict_what_the_saved_ones_do(priors: Priors, points: np
     priors.save(tmp_path / "priors")
     loaded = Priors.load(tmp_path / "priors")
     assert [p.name for p in tmp_path.iterdir()] == ["priors"]
-    assert loaded.config == priors.config
+    assert loaded.config == priors.config == Priors.load(tmp_path).config
     key = jax.random.key(1)
     for a, b in zip(priors.predict(points, 0.3, key=key), loaded.predict(points, 0.3, key=key), strict=True):
         np.testing.assert_array_equal(a, b)
@@ -80,6 +80,11 @@ def test_clouds_of_any_size_are_taken(priors: Priors, n: int) -> None:
 def test_wrong_input_is_named(priors: Priors, points: np.ndarray, change: dict, message: str) -> None:
     with pytest.raises(PriorsError, match=message):
         priors.predict(**({"points": points, "task": 0.3} | change))
+
+
+def test_no_proposals_are_refused(priors: Priors, points: np.ndarray) -> None:
+    with pytest.raises(UserError, match="--proposals 0: must be at least 1"):
+        priors.predict(points, 0.3, n_proposals=0)
 
 
 def damage(folder: Path, how: str) -> None:
@@ -156,9 +161,11 @@ def test_exported_stablehlo_computes_what_the_priors_do(priors: Priors, points: 
         np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-5)
 
 
-def test_an_unknown_export_format_writes_nothing(priors: Priors, tmp_path: Path) -> None:
+def test_an_export_that_cannot_be_made_writes_nothing(priors: Priors, tmp_path: Path) -> None:
     with pytest.raises(UserError, match="--format onnx: not one of flax, stablehlo"):
         export(priors, tmp_path / "out", ("flax", "onnx"))
+    with pytest.raises(UserError, match="--proposals 0: must be at least 1"):
+        export(priors, tmp_path / "out", n_proposals=0)
     assert not (tmp_path / "out").exists()
 
 

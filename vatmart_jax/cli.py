@@ -160,7 +160,7 @@ def _evaluate(argv: list[str]) -> None:
         data: Path | None = None
         """default: the data that the run was trained on"""
         metrics: str = "priors,downstream"
-        """priors, downstream, or both"""
+        """priors (accuracy, coverage), downstream (success), policy (on training objects); several with commas"""
         methods: str = "ours,random"
         """of downstream: ours, random, expert (a script that knows the joint: the ceiling)"""
         trials: int = 350
@@ -169,7 +169,7 @@ def _evaluate(argv: list[str]) -> None:
         """physics; default as for training"""
         seed: int = 1
         out: Path | None = None
-        """folder for evaluation.json and evaluation.md; default the run folder"""
+        """folder for evaluation.json, evaluation.md and reliability.png; default the run folder"""
         json: _Json = False
 
     args = tyro.cli(Evaluate, args=argv, prog="vatmart evaluate")
@@ -372,12 +372,9 @@ def _predict(argv: list[str]) -> None:
     _enable_compilation_cache()
     from vatmart_jax.inference import Priors, amount, read_cloud, read_mask
 
-    folder = args.priors / "priors" if (args.priors / "priors").is_dir() else args.priors
-    priors = Priors.load(folder)
+    priors = Priors.load(args.priors)
     points = read_cloud(args.cloud)
     mask = None if args.mask is None else read_mask(args.mask, len(points))
-    if args.proposals < 1:
-        raise UserError(f"--proposals {args.proposals}: must be at least 1")
     import jax
 
     key, task = jax.random.key(args.seed), amount(args.task, priors.config.task)
@@ -418,8 +415,7 @@ def _export(argv: list[str]) -> None:
     from vatmart_jax.export import export
     from vatmart_jax.inference import Priors
 
-    folder = args.run / "priors" if (args.run / "priors").is_dir() else args.run
-    files = export(Priors.load(folder), args.out, tuple(args.format.split(",")), args.proposals)
+    files = export(Priors.load(args.run), args.out, tuple(args.format.split(",")), args.proposals)
     _print_result({"files": [str(f) for f in files]}, args.json)
 
 

@@ -13,6 +13,12 @@ def one_of(flag: str, value: str, known: Iterable[str]) -> None:
         raise UserError(f"{flag} {value}: not one of {', '.join(known)}")
 
 
+def at_least_one(flag: str, value: int) -> None:
+    """Raises UserError for a count below 1."""
+    if value < 1:
+        raise UserError(f"{flag} {value}: must be at least 1")
+
+
 class OpenGLError(UserError):
     """MuJoCo finds no OpenGL to draw with, either on import or when a renderer is made."""
 

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from jax import export as jax_export
 
 from vatmart_jax.config import to_json
-from vatmart_jax.errors import one_of
+from vatmart_jax.errors import at_least_one, one_of
 from vatmart_jax.files import whole_folder, write_json
 from vatmart_jax.inference import Priors, predict
 
@@ -23,10 +23,11 @@ def export(priors: Priors, out: Path | str, formats: Sequence[str] = FORMATS, n_
 
     `flax/` loads with `Priors.load`. `stablehlo/priors.bin` loads with `jax.export.deserialize` (any StableHLO runtime
     for the module within) and is one function, parameters included; `stablehlo/signature.json` names what goes in and
-    comes out. Raises UserError for an unknown format, before anything is written.
+    comes out. Raises UserError for an unknown format or no proposals, before anything is written.
     """
     for name in formats:
         one_of("--format", name, FORMATS)
+    at_least_one("--proposals", n_proposals)
     out = Path(out)
     for name in formats:
         if name == "flax":

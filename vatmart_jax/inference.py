@@ -1,6 +1,6 @@
 """Trained priors: save, load, and predict from a point cloud.
 
-    priors = Priors.load("run/priors")
+    priors = Priors.load("run")
     prediction = priors.predict(points, task=0.3)
 
 A folder of priors holds `config.json` and `params.msgpack` (Flax), and needs nothing else.
@@ -22,7 +22,7 @@ import trimesh
 from flax import serialization
 
 from vatmart_jax.config import from_json, to_json
-from vatmart_jax.errors import UserError
+from vatmart_jax.errors import UserError, at_least_one
 from vatmart_jax.files import whole, whole_folder, write_json
 from vatmart_jax.perception.networks import Features, Networks, NetworksConfig, Params
 from vatmart_jax.perception.pointnet2 import group
@@ -81,8 +81,12 @@ class Priors:
 
     @classmethod
     def load(cls, path: Path | str) -> Priors:
-        """Raises PriorsError where the folder is missing, damaged, or holds other networks than its config says."""
+        """From a folder of priors, or from a run folder, which has them in priors/.
+
+        Raises PriorsError where the folder is missing, damaged, or holds other networks than its config says.
+        """
         path = Path(path)
+        path = path / "priors" if (path / "priors").is_dir() else path
         config = _read_config(path / "config.json")
         file = path / "params.msgpack"
         try:
@@ -108,8 +112,9 @@ class Priors:
         points: [N, 3] partial cloud, object frame (z up, front towards -x, unit lengths). task: amount > 0, rad or
         unit lengths. part_mask: [N] bool, restricts the contact to these points. key: which points the networks see
         where the cloud has more than they were trained with, and the proposals' randomness; consumed. Raises
-        PriorsError for input that does not fit.
+        UserError for input that does not fit.
         """
+        at_least_one("--proposals", n_proposals)
         points = np.asarray(points, np.float32)
         if points.ndim != 2 or points.shape[1] != 3 or not len(points) or not np.isfinite(points).all():
             raise PriorsError(f"points: expected finite [N, 3] coordinates, found shape {points.shape}")

@@ -83,7 +83,7 @@ def play(
     bank, views = SceneBank.load(folder / "scenes.npz"), ViewBank.load(folder / "views.npz")
     chosen = np.array([find_scene(bank, scene)])
     kind = "door" if bank.joint_type[chosen[0]] == HINGE else "drawer"
-    priors = Priors.load(run / "priors") if run else None
+    priors = Priors.load(run) if run else None
     name = task or (priors.config.task if priors else f"push-{kind}")
     one_of("--task", name, TASKS)
     env = Env(bank.select(chosen), views.of_scenes(chosen), TASKS[name], "c", EnvConfig(batch=TRIES))
