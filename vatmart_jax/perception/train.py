@@ -188,19 +188,24 @@ class Selection(NamedTuple):
     actionability: jax.Array  # [B, C] probability
 
 
-def clouds_of(
-    bank: ViewBank, config: PointNetConfig, on_progress: Callable[[int, int], None] = lambda done, total: None
-) -> Clouds:
-    """The first n_points of every view, grouped; `on_progress(done, total)` counts views.
-
-    Raises UserError where the bank's views have fewer points.
-    """
+def points_of(bank: ViewBank, config: PointNetConfig) -> np.ndarray:
+    """The first n_points of every view. Raises UserError where the bank's views have fewer."""
     if bank.points.shape[1] < config.n_points:
         raise UserError(
             f"the views have {bank.points.shape[1]} points, the networks want {config.n_points}; convert again with "
             f"--points {config.n_points}, or choose another preset"
         )
-    points = bank.points[:, : config.n_points]
+    return bank.points[:, : config.n_points]
+
+
+def clouds_of(
+    bank: ViewBank, config: PointNetConfig, on_progress: Callable[[int, int], None] = lambda done, total: None
+) -> Clouds:
+    """The points that the networks see of every view, grouped; `on_progress(done, total)` counts views.
+
+    Raises UserError where the bank's views have too few.
+    """
+    points = points_of(bank, config)
     total, size, parts = len(bank), 16, []
     for start in range(0, total, size):
         # The last batch is filled up with the last view: one shape, one compilation.

@@ -15,7 +15,6 @@ from flax import struct
 
 from vatmart_jax.bank import SLIDE
 from vatmart_jax.env import Env, Start, Task
-from vatmart_jax.errors import UserError
 from vatmart_jax.perception import train as perception
 from vatmart_jax.perception.networks import Networks
 from vatmart_jax.perception.train import Clouds, PerceptionConfig, PerceptionState, Samples
@@ -56,11 +55,7 @@ class Training:
         self._clouds: Clouds | None = None
         self._score = partial(perception.score_trajectories, self.networks)
         self._begun = time.monotonic()
-        wanted, found = self.config.networks.pointnet.n_points, env.views.points.shape[1]
-        if found < wanted:  # said before hours of exploration
-            raise UserError(
-                f"the views have {found} points, the networks want {wanted}; convert with --points {wanted}"
-            )
+        perception.points_of(env.views, self.config.networks.pointnet)  # too few: said before hours of exploration
 
     def key(self, purpose: str, index: int | jax.Array = 0) -> jax.Array:
         """A key for one use, the same whenever the run is resumed."""
