@@ -21,13 +21,14 @@ import tyro
 
 from vatmart_jax import geometry as g
 from vatmart_jax.bank import SceneBank, ViewBank
-from vatmart_jax.bench import device, random_trials, valid_starts
+from vatmart_jax.bench import device, random_trials
 from vatmart_jax.env import TASKS, Env, EnvConfig, EnvState, Start
 from vatmart_jax.expert import run_expert
 from vatmart_jax.files import write_json
 from vatmart_jax.physics import PhysicsConfig
 from vatmart_jax.physics.controller import waypoint_controls
 from vatmart_jax.physics.template import HAND, N_CTRL, PART, scene_model
+from vatmart_jax.pipeline.explore import start_pool
 
 
 @dataclass(frozen=True)
@@ -149,7 +150,7 @@ def study(args: Study, name: str, bank: SceneBank, views: ViewBank) -> dict[str,
     make = lambda physics: Env(bank, views, TASKS[name], "c", EnvConfig(batch=args.trials), physics)  # noqa: E731
     env, finer = make(config), make(halved)
     k_start, k_noise, k_any, k_track = jax.random.split(jax.random.key(args.seed), 4)
-    start = valid_starts(env, args.trials, k_start)
+    start = start_pool(env, k_start, args.trials)
     noisy = jax.jit(partial(random_trials, env))(start, k_noise)
     result = {
         "scenes": len(np.unique(noisy.physics.scene)),

@@ -12,6 +12,7 @@ from vatmart_jax.bank import HINGE
 from vatmart_jax.env import TASKS, Env
 from vatmart_jax.perception.networks import NetworksConfig
 from vatmart_jax.perception.pointnet2 import Level, PointNetConfig
+from vatmart_jax.pipeline.explore import start_pool
 
 TINY = PointNetConfig(
     n_points=64,
@@ -69,7 +70,7 @@ def test_boxes_behave_nearly_as_the_hulls_they_were_whatever_the_order_of_scenes
 def test_random_trials_repeat_exactly_open_loop(cabinets):
     env = Env(*cabinets, TASKS["push-drawer"])
     key = jax.random.key(0)
-    start = bench.valid_starts(env, 16, key)
+    start = start_pool(env, key, 16)
     closed = jax.jit(lambda start: bench.random_trials(env, start, key))(start)
     # Until they succeed: a trial stops there, its trajectory stays.
     again = jax.jit(env.execute)(start, closed.residuals)

@@ -32,12 +32,12 @@ from vatmart_jax.perception.networks import Networks
 from vatmart_jax.perception.pointnet2 import group
 from vatmart_jax.physics.controller import hand_target, waypoint_controls
 from vatmart_jax.physics.interface import IMPLS
+from vatmart_jax.pipeline.explore import start_pool
 from vatmart_jax.presets import PRESETS
 
 Say = Callable[[str], None]
 NOISE = 0.3  # of the actions of random trials, beside the scripted expert's
 APPROACH, ADVANCES = (0.1,), (0.05, 0.05, 0.05)  # waypoints of a steady push, unit lengths
-_DRAWS = 50  # times that starts are drawn for a batch of valid ones
 
 
 @dataclass(frozen=True)
@@ -86,13 +86,13 @@ def _physics(choice: Choice, impl: str, batch: int, task: str, seed: int, second
     begun = time.perf_counter()
     env = Env(*choice.banks(seed), TASKS[task], impl, EnvConfig(batch=batch))
     build_seconds = time.perf_counter() - begun
-    key = jax.random.key(seed)
-    start = valid_starts(env, batch, key)
+    key, k_start, k_noise = jax.random.split(jax.random.key(seed), 3)
+    start = start_pool(env, k_start, batch)
     press = jax.jit(partial(_press, env))
     touching = press(jax.jit(env.begin)(start), jnp.array(APPROACH))
     pressing = _timed(lambda _: press(touching, jnp.array(ADVANCES)), seconds)
 
-    residuals = jax.jit(partial(random_trials, env))(start, key).residuals
+    residuals = jax.jit(partial(random_trials, env))(start, k_noise).residuals
 
     @jax.jit
     def trials(key: jax.Array) -> EnvState:
@@ -151,9 +151,9 @@ def bench_parity(
             begun = time.perf_counter()
             env = Env(its_bank, views, task, impl)
             if not outcomes[name]:
-                key = jax.random.key(seed)
-                start = valid_starts(env, trials, key)
-                residuals = jax.jit(partial(random_trials, env))(start, key).residuals
+                k_start, k_noise = jax.random.split(jax.random.key(seed))
+                start = start_pool(env, k_start, trials)
+                residuals = jax.jit(partial(random_trials, env))(start, k_noise).residuals
             outcomes[name][variant] = jax.device_get(jax.jit(env.execute)(start, residuals))
             say(f"{name} on {variant}: {time.perf_counter() - begun:.0f} s")
     if not outcomes:
@@ -233,28 +233,6 @@ def bench_perception(choice: Choice, preset: str, seed: int, seconds: float) -> 
         "device": device(),
         "load": round(os.getloadavg()[0], 1),
     }
-
-
-def valid_starts(env: Env, n: int, key: jax.Array) -> Start:
-    """n random starts that are free and, when pulling, hold the part. Consumes the key.
-
-    Raises UserError where hardly any is.
-    """
-
-    @jax.jit
-    def draw(key: jax.Array) -> tuple[Start, jax.Array]:
-        start = env.sample(key, n)
-        return start, env.begin(start).valid
-
-    found: list[Start] = []
-    count = 0
-    for k in range(_DRAWS):
-        start, valid = jax.device_get(draw(jax.random.fold_in(key, k)))
-        found.append(jax.tree.map(lambda x, valid=valid: x[valid], start))
-        count += int(valid.sum())
-        if count >= n:
-            return jax.tree.map(lambda *x: jnp.asarray(np.concatenate(x)[:n]), *found)
-    raise UserError(f"task {env.task.name}: {count} of {_DRAWS * n} starts are free; give data with more views")
 
 
 def random_trials(env: Env, start: Start, key: jax.Array) -> EnvState:

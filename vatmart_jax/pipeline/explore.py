@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -54,7 +55,6 @@ class Explorer:
         self.td3 = TD3(config.td3, OBSERVATION, ACTION)
         self.iterate = jax.jit(self._iterate)
         self.run = jax.jit(self._run, static_argnames="abandon")
-        self.random_starts = jax.jit(env.reset)
 
     def init(self, key: jax.Array) -> ExploreState:
         """Consumes the key."""
@@ -127,24 +127,25 @@ class Explorer:
         return ExploreState(td3, replay, key, state.iteration + 1), final, metrics
 
 
-def start_pool(explorer: Explorer, key: jax.Array, size: int, progress=lambda done: None) -> Start:
+def start_pool(env: Env, key: jax.Array, size: int, progress: Callable[[int], None] = lambda done: None) -> Start:
     """`size` starts that are free and, when pulling, grasp. Consumes the key.
 
     Raises UserError where fewer than one in two hundred random starts will do: the data does not fit the task.
     """
+    reset = jax.jit(env.reset)
     kept: list[Start] = []
     found = tried = 0
     while found < size:
         key, sub = jax.random.split(key)
-        state = explorer.random_starts(sub)
+        state = reset(sub)
         good = jnp.flatnonzero(state.valid)
         kept.append(jax.tree.map(lambda x: x[good], state.start))  # noqa: B023
         found += len(good)
         tried += len(state.valid)
         progress(min(found, size))
-        if tried >= 20 * explorer.env.config.batch and found < tried / 200:
+        if tried >= 20 * env.config.batch and found < tried / 200:
             raise UserError(
-                f"only {found} of {tried} random starts of task {explorer.env.task.name} are free and hold: "
+                f"only {found} of {tried} random starts of task {env.task.name} are free and hold: "
                 "the objects do not fit the gripper; look at the conversion's report"
             )
     return jax.tree.map(lambda *parts: jnp.concatenate(parts)[:size], *kept)

@@ -95,7 +95,7 @@ class Training:
         if self._pool is None:
             size = self._settings.explore.pool
             self._pool = start_pool(
-                self._explorer, self.key("pool"), size, lambda done: self._report("find starts", done, size, {})
+                self._env, self.key("pool"), size, lambda done: self._report("find starts", done, size, {})
             )
         return self._pool
 
