@@ -17,17 +17,18 @@ def score_loss(logits: jax.Array, labels: jax.Array) -> jax.Array:
 def reconstruction_losses(
     predicted: jax.Array, truth: jax.Array, weights: jax.Array
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Of trajectories [..., 30] with row weights [...]: mean L1 of the moves (unit lengths) and of the Euler
-    residuals (rad), and the squared distance of the two columns of the start rotation.
+    """Of trajectories [..., 30] with row weights [...]: mean L1 of where the fingertips are after each waypoint (unit
+    lengths) and of the hand's Euler angles there (rad), and the squared distance of the start rotation's two columns.
 
-    Where the paper has one L1, the released code averages moves and turns. Its angle between rotations has no finite
+    Both are relative to the start: errors of residuals add up to where the part is left, which decides success. Where
+    the paper has one L1, the released code averages moves and turns. Its angle between rotations has no finite
     gradient at 0; the squared distance of 6D numbers (Zhou et al. 2019) has, and keeps the raw output near unit length.
     """
-    error = jnp.abs(predicted - truth)
-    steps = error[..., 6:].reshape(*error.shape[:-1], -1, 6)
+    difference = predicted - truth
+    steps = jnp.abs(jnp.cumsum(difference[..., 6:].reshape(*difference.shape[:-1], -1, 6), -2))
     mean = lambda x: jnp.sum(x * weights) / jnp.maximum(weights.sum(), 1)  # noqa: E731
     moves, turns = steps[..., :3].mean((-2, -1)), steps[..., 3:].mean((-2, -1))
-    return mean(moves), mean(turns), mean(jnp.sum(error[..., :6] ** 2, -1))
+    return mean(moves), mean(turns), mean(jnp.sum(difference[..., :6] ** 2, -1))
 
 
 def kl_loss(mean: jax.Array, log_variance: jax.Array, weights: jax.Array) -> jax.Array:

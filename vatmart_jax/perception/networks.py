@@ -183,11 +183,23 @@ class TrajectoryHead(nn.Module):
 
     @nn.compact
     def __call__(self, f: jax.Array, contact: jax.Array, task: jax.Array, trajectory: jax.Array) -> jax.Array:
-        x = trajectory * jnp.array(SCALE)
+        positions = waypoint_positions(contact, trajectory)
+        trajectory = jnp.broadcast_to(trajectory, (*positions.shape[:-1], TRAJECTORY))
+        x = jnp.concatenate([trajectory * jnp.array(SCALE), positions], -1)
         for width in self.config.trajectory[:-1]:
             x = nn.leaky_relu(nn.Dense(width)(x))
         x = nn.Dense(self.config.trajectory[-1])(x)
         return Head(self.config, self.widths)(f, contact, task, x)
+
+
+def waypoint_positions(contact: jax.Array, trajectory: jax.Array) -> jax.Array:
+    """[..., 12] where the fingertips are sent, from the standoff on: contact [..., 3] and residuals summed up.
+
+    What the sum is decides whether the part arrives; the trajectory encoder need not learn to add.
+    """
+    moves = jnp.cumsum(trajectory[..., 6:].reshape(*trajectory.shape[:-1], WAYPOINTS, 6), -2)[..., :3]
+    positions = contact[..., None, :] + moves
+    return positions.reshape(*positions.shape[:-2], 3 * WAYPOINTS)
 
 
 class DenseOfParts(nn.Module):
