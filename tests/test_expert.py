@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 from vatmart_jax import geometry as g
-from vatmart_jax.env import TASKS, Env, EnvConfig, grasps, promising_contacts
+from vatmart_jax.contacts import grasps, promising_contacts
+from vatmart_jax.env import TASKS, Env, EnvConfig
 from vatmart_jax.expert import expert_start, run_expert
 
 KEY = jax.random.key(0)
@@ -40,7 +41,7 @@ def test_a_view_that_shows_nowhere_to_push_is_no_trial(cabinets):
     bank, views = bank.select(drawers), views.of_scenes(drawers)
     inside = views.select(slice(None))
     inside.contact_normals[0] *= -1  # the camera sees the back of the front
-    assert not promising_contacts(bank, inside, task)[0].any()
+    assert not promising_contacts(bank, inside, task.opening)[0].any()
 
 
 def test_handles_are_grasped_from_the_front_across_their_thin_side(cabinets):
