@@ -40,6 +40,8 @@ from vatmart_jax.bank import SceneBank
 
 RESULTS = Path(__file__).parent / "results" / "conversion.json"
 
+Group = tuple[str, str, dict[str, Any]]  # object, link, gap_max and phantom_share of its hulls
+
 
 @dataclass(frozen=True)
 class Check:
@@ -156,6 +158,13 @@ def fidelity(check: Check) -> dict[str, Any]:
         moving += [(r["id"], k, g) for k, g in r["groups"].items() if k in parts]
         rest += [(r["id"], k, g) for k, g in r["groups"].items() if k == static and k not in parts]
         handles += [(r["id"], h["link"], h["hulls"]) for h in r["handles"] if h["visual"]]
+    lost = [f"{i} {link}" for i, link, kept in handles if not kept]
+    of_handles = {"passable": len(handles), "kept": sum(kept for *_, kept in handles), "lost": lost}
+    return _gaps_and_phantoms(moving, rest) | {"handles": of_handles}
+
+
+def _gaps_and_phantoms(moving: list[Group], rest: list[Group], phantoms: int = 5) -> dict[str, Any]:
+    """Of doors and drawers, and of all that stands still; `phantoms` of the worst are named."""
     out: dict[str, Any] = {}
     for name, rows, bound in (("moving", moving, 0.02), ("static", rest, 0.05)):
         gap, phantom = [g["gap_max"] for *_, g in rows], [g["phantom_share"] for *_, g in rows]
@@ -166,17 +175,12 @@ def fidelity(check: Check) -> dict[str, Any]:
             "phantom_share": spread(phantom),
             f"phantom_within_{bound}": share(phantom, bound),
             "worst_gap": _worst(rows, "gap_max"),
-            "worst_phantom": _worst(rows, "phantom_share"),
+            "worst_phantom": _worst(rows, "phantom_share", phantoms),
         }
-    out["handles"] = {
-        "passable": len(handles),
-        "kept": sum(kept for *_, kept in handles),
-        "lost": [f"{i} {link}" for i, link, kept in handles if not kept],
-    }
     return out
 
 
-def _worst(rows: list[tuple[str, str, dict[str, Any]]], key: str, n: int = 5) -> dict[str, float]:
+def _worst(rows: list[Group], key: str, n: int = 5) -> dict[str, float]:
     return {f"{i} {k}": _round(g[key]) for i, k, g in sorted(rows, key=lambda r: -r[2][key])[:n] if g[key] > 0}
 
 
@@ -195,19 +199,7 @@ def sight(check: Check) -> dict[str, Any]:
             if hulls and visuals and (root in parts or root == converted.obj.root):
                 found = _by_sight(visuals, [h.vertices for h in hulls], np.random.default_rng(check.seed))
                 (moving if root in parts else rest).append((r["id"], root, found))
-    out: dict[str, Any] = {}
-    for name, rows, bound in (("moving", moving, 0.02), ("static", rest, 0.05)):
-        gap, phantom = [g["gap_max"] for *_, g in rows], [g["phantom_share"] for *_, g in rows]
-        out[name] = {
-            "groups": len(rows),
-            "gap": spread(gap),
-            "gap_within_0.005": share(gap, 0.005),
-            "phantom_share": spread(phantom),
-            f"phantom_within_{bound}": share(phantom, bound),
-            "worst_gap": _worst(rows, "gap_max"),
-            "worst_phantom": _worst(rows, "phantom_share", 12),
-        }
-    return out
+    return _gaps_and_phantoms(moving, rest, phantoms=12)
 
 
 def _by_sight(visuals: list[Visual], hulls: list[np.ndarray], rng: np.random.Generator) -> dict[str, float]:
