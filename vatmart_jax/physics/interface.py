@@ -6,6 +6,7 @@ from importlib.util import find_spec
 from typing import Protocol
 
 import jax
+import jax.numpy as jnp
 from flax import struct
 
 from vatmart_jax.bank import SceneBank
@@ -26,6 +27,11 @@ class PhysicsState:
     in_contact: jax.Array  # [B] bool, the gripper touches the object
     diverged: jax.Array  # [B] bool, MuJoCo warned or a number was not finite; the state stays the last good one
     exact: jax.Array  # [B, n] uint32, what the implementation keeps beyond float32 (bits of float64), n may be 0
+
+
+def bits_of(x: jax.Array) -> jax.Array:
+    """float32 as `PhysicsState.exact` keeps it."""
+    return jax.lax.bitcast_convert_type(x, jnp.uint32)
 
 
 class Physics(Protocol):

@@ -13,7 +13,7 @@ from mujoco.mjx._src import math, mesh  # no public names for these; mujoco-mjx 
 
 from vatmart_jax import geometry as g
 from vatmart_jax.bank import SceneBank
-from vatmart_jax.physics.interface import PhysicsState
+from vatmart_jax.physics.interface import PhysicsState, bits_of
 from vatmart_jax.physics.template import PhysicsConfig, Template, scene_model, template
 
 # MJX tests every pair of geoms that it is given, near or not. So each of the gripper's three boxes gets its own nearest
@@ -86,7 +86,7 @@ class MjxPhysics:
         sound = jnp.isfinite(qpos).all(-1) & jnp.isfinite(gripper_pose).all(-1)
         touches = jax.vmap(contact)(self._rows(scene), gripper_pose, qpos)
         zero = jnp.zeros_like(qpos)
-        return PhysicsState(scene, gripper_pose, qpos, zero, touches & sound, ~sound, _bits(zero))
+        return PhysicsState(scene, gripper_pose, qpos, zero, touches & sound, ~sound, bits_of(zero))
 
     def rollout(self, state: PhysicsState, ctrl: jax.Array, active: jax.Array) -> PhysicsState:
         rows, pose = self._rows(state.scene), state.gripper_pose
@@ -115,7 +115,7 @@ class MjxPhysics:
             qvel=kept(qvel, state.qvel),
             in_contact=jnp.where(runs & sound, touches, state.in_contact),
             diverged=state.diverged | (runs & ~sound),
-            exact=kept(_bits(warmstart), state.exact),
+            exact=kept(bits_of(warmstart), state.exact),
         )
 
     def _rows(self, scene: jax.Array) -> SceneRow:
@@ -257,7 +257,3 @@ def _without_copies(data: mjx.Data) -> mjx.Data:
 
 def _touches(data: mjx.Data) -> jax.Array:
     return (data._impl.contact.dist < 0).any()
-
-
-def _bits(x: jax.Array) -> jax.Array:
-    return jax.lax.bitcast_convert_type(x, jnp.uint32)

@@ -21,7 +21,7 @@ import warp as wp
 from jax.custom_batching import custom_vmap
 
 from vatmart_jax.bank import SceneBank
-from vatmart_jax.physics.interface import PhysicsState
+from vatmart_jax.physics.interface import PhysicsState, bits_of
 from vatmart_jax.physics.template import N_CTRL, N_QPOS, SCENE_FIELDS, PhysicsConfig, Template, template
 
 wp.config.log_level = max(wp.config.log_level, wp.LOG_ERROR)  # it logs to standard output, which is for results
@@ -57,7 +57,7 @@ class WarpPhysics:
         finite = jnp.isfinite(qpos).all(-1) & jnp.isfinite(pose).all(-1)
         contact, sound = self._contact(scene, pose, qpos, finite)
         rest = jnp.zeros_like(qpos)
-        return PhysicsState(scene, pose, qpos, rest, contact, ~sound, _bits(rest))
+        return PhysicsState(scene, pose, qpos, rest, contact, ~sound, bits_of(rest))
 
     def rollout(self, state: PhysicsState, ctrl: jax.Array, active: jax.Array) -> PhysicsState:
         ctrl = jnp.asarray(ctrl, jnp.float32)
@@ -73,7 +73,7 @@ class WarpPhysics:
             qvel=jnp.where(good[:, None], qvel, state.qvel),
             in_contact=jnp.where(good, contact, state.in_contact),
             diverged=diverged | (active & ~sound),
-            exact=jnp.where(good[:, None], _bits(warmstart), state.exact),
+            exact=jnp.where(good[:, None], bits_of(warmstart), state.exact),
         )
 
     def _contact(self, scene, *rest):
@@ -287,10 +287,6 @@ def _flag_contacts(contacts: wp.array[int], contact_world: wp.array[int], contac
     i = wp.tid()
     if i < contacts[0]:
         contact_out[contact_world[i]] = True
-
-
-def _bits(x: jax.Array) -> jax.Array:
-    return jax.lax.bitcast_convert_type(x, jnp.uint32)
 
 
 def _flat_vmap(call):
