@@ -11,6 +11,7 @@ import pytest
 from vatmart_jax.config import from_json, to_json
 from vatmart_jax.env import EnvConfig
 from vatmart_jax.errors import UserError
+from vatmart_jax.evaluation.evaluate import METRICS, evaluate
 from vatmart_jax.perception.networks import NetworksConfig
 from vatmart_jax.perception.pointnet2 import Level, PointNetConfig
 from vatmart_jax.perception.train import PerceptionConfig
@@ -71,6 +72,37 @@ def test_a_run_leaves_everything_its_readers_need(finished):
     assert list(dict.fromkeys(stages)) == [
         "explore", "collect", "scorer", "proposal", "actionability", "curiosity", "finetune",
     ]  # fmt: skip
+
+
+def test_an_evaluation_has_the_priors_the_trials_the_policy_and_what_the_scores_were_worth(finished, tmp_path):
+    run_folder, _ = finished
+    result, table = evaluate(
+        [run_folder],
+        lambda data: data or run_folder,
+        None,
+        METRICS,
+        ("ours", "expert"),
+        24,
+        "c",
+        1,
+        tmp_path,
+        lambda *_: None,
+    )
+    (found,) = result["runs"]
+    assert [(row["split"], row["method"]) for row in found["downstream"]] == [
+        (split, method) for split in ("test_shapes", "test_categories") for method in ("ours", "expert")
+    ]
+    assert {row["split"] for row in found["priors"]} == {"test_shapes", "test_categories"}
+    (policy,) = found["policy"]
+    assert policy["split"] == "train" and policy["trials"] == 24 and 0 <= policy["success"] <= 1
+    ours, expert = found["downstream"][:2]
+    assert sum(ours["reliability"]["count"]) == 24 and ours["said"] == pytest.approx(
+        np.average(ours["reliability"]["said"], weights=ours["reliability"]["count"]), abs=1e-3
+    )
+    assert "said" not in expert and "reliability" not in expert
+    assert json.loads((tmp_path / "evaluation.json").read_text())["runs"] == [found]
+    assert (tmp_path / "evaluation.md").read_text().startswith(table)
+    assert (tmp_path / "reliability.png").stat().st_size > 10_000
 
 
 @pytest.mark.parametrize("stage, done", [("explore", 2), ("scorer", 3)])

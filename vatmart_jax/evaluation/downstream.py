@@ -16,9 +16,11 @@ import numpy as np
 
 from vatmart_jax import geometry as g
 from vatmart_jax.env import Env, EnvState, Start
-from vatmart_jax.evaluation.metrics import wilson_interval
+from vatmart_jax.evaluation.metrics import reliability, wilson_interval
 
-Method = Callable[[Start, jax.Array], EnvState]  # views and tasks (contact and rotation may be replaced), key
+Method = Callable[[Start, jax.Array], tuple[EnvState, jax.Array | None]]
+"""Final states for views and tasks (contact and rotation may be replaced) and a key, and what it thought of its chances
+[B], if it says."""
 
 
 def random_method(env: Env) -> Method:
@@ -26,7 +28,7 @@ def random_method(env: Env) -> Method:
     limits = jnp.array([env.config.move_range] * 3 + [env.config.turn_range] * 3)
 
     @jax.jit
-    def run(start: Start, key: jax.Array) -> EnvState:
+    def run(start: Start, key: jax.Array) -> tuple[EnvState, None]:
         kc, kr, kn, ka = jax.random.split(key, 4)
         n = len(start.view)
         contact = jax.random.randint(kc, (n,), 0, env.views.contacts.shape[1])
@@ -34,7 +36,7 @@ def random_method(env: Env) -> Method:
         up = g.cone_direction(ka, -normal, env.config.cone)
         rotation = g.gripper_frame(up, jax.random.normal(kn, up.shape))
         residuals = jax.random.uniform(kr, (n, g.WAYPOINTS, 6), minval=-1.0) * limits
-        return env.execute(start.replace(contact=contact, rotation=rotation), residuals)
+        return env.execute(start.replace(contact=contact, rotation=rotation), residuals), None
 
     return run
 
@@ -44,13 +46,15 @@ def downstream(
 ) -> dict[str, Any]:
     """Success of a method over `trials` random views and tasks; the same ones for every method with the same key.
 
+    Of a method that scores its trials also the mean score (`said`) and the reliability curve.
+
     Consumes the key.
     """
     sample = jax.jit(lambda key: env.sample(key, env.config.batch))
     rows: list[dict[str, np.ndarray]] = []
     for batch in range(-(-trials // env.config.batch)):
         ks, km = jax.random.split(jax.random.fold_in(key, batch))
-        final = method(sample(ks), km)
+        final, score = method(sample(ks), km)
         task = final.start.task
         within = jnp.abs(final.progress - task[:, None]) <= env.config.tolerance * task[:, None]
         outcome = {
@@ -60,7 +64,7 @@ def downstream(
             "lost_grip": ~final.in_collision & ~final.held,
             "diverged": final.physics.diverged,
             "scene": final.physics.scene,
-        }
+        } | ({} if score is None else {"said": score})
         rows.append(jax.device_get(outcome))
         progress(min(trials, (batch + 1) * env.config.batch))
     joined = {name: np.concatenate([row[name] for row in rows])[:trials] for name in rows[0]}
@@ -69,6 +73,8 @@ def downstream(
         str(name): round(float(joined["success"][env.bank.object_id[scenes] == name].mean()), 3)
         for name in np.unique(env.bank.object_id[scenes])
     }
-    rates = {name: float(value.mean()) for name, value in joined.items()}
+    rates: dict[str, Any] = {name: float(value.mean()) for name, value in joined.items()}
+    if "said" in joined:
+        rates["reliability"] = reliability(joined["said"], joined["success"]).to_json()
     interval = [float(x) for x in wilson_interval(int(joined["success"].sum()), trials)]
     return {"trials": trials, "ci95": interval, **rates, "per_object": per_object}

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
-from functools import partial
 from pathlib import Path
 from typing import Any
 
 import jax
+import numpy as np
 from flax import serialization
 
 from vatmart_jax.config import from_json
@@ -16,6 +16,7 @@ from vatmart_jax.data import SPLITS, Data, DataError
 from vatmart_jax.env import TASKS, Env
 from vatmart_jax.errors import UserError, one_of
 from vatmart_jax.evaluation.downstream import Method, downstream, random_method
+from vatmart_jax.evaluation.metrics import wilson_interval
 from vatmart_jax.evaluation.priors import labelled, priors_metrics
 from vatmart_jax.expert import run_expert
 from vatmart_jax.files import write_json, write_text
@@ -23,12 +24,13 @@ from vatmart_jax.inference import Priors
 from vatmart_jax.perception.train import clouds_of
 from vatmart_jax.physics.interface import IMPLS
 from vatmart_jax.pipeline.collect import ProposalTrials
-from vatmart_jax.pipeline.explore import Explorer
+from vatmart_jax.pipeline.explore import Explorer, start_pool
+from vatmart_jax.pipeline.pictures import reliability_curves
 from vatmart_jax.pipeline.run import read_config
 from vatmart_jax.presets import Settings
 
 METHODS = ("ours", "random", "expert")
-METRICS = ("priors", "downstream")
+METRICS = ("priors", "downstream", "policy")
 _LABELLED = 350  # positives, and as many negatives (paper, section 5.1)
 
 Report = Callable[[str, int, int, dict[str, float]], None]
@@ -48,8 +50,9 @@ def evaluate(
 ) -> tuple[dict[str, Any], str]:
     """Evaluate finished runs on test shapes and unseen categories; returns the JSON and a Markdown table.
 
-    prepared: the converted folder of a --data; data: overrides what a run was trained on. Writes evaluation.json and
-    evaluation.md into `out`, or into each run's folder. Raises UserError for what cannot be evaluated.
+    prepared: the converted folder of a --data; data: overrides what a run was trained on. Writes evaluation.json,
+    evaluation.md and reliability.png into `out`, or into each run's folder. Raises UserError for what cannot be
+    evaluated.
     """
     for flag, given, known in (("--metrics", metrics, METRICS), ("--methods", methods, METHODS)):
         for name in given:
@@ -78,21 +81,30 @@ def _evaluate_run(folder, prepared, data, metrics, methods, trials, impl, seed, 
     settings = from_json(Settings, config["settings"], f"{folder}/config.json: settings")
     converted = Data(prepared(data or (config["data"] and Path(config["data"]))))
     key = jax.random.key(seed)
-    rows, scores = [], []
-    for number, split in enumerate(SPLITS[1:]):
+    result: dict[str, Any] = {"run": str(folder), "task": task.name, "seed": seed}
+    result |= {"downstream": [], "priors": [], "policy": []}
+    for number, split in enumerate((*SPLITS[1:], SPLITS[0])):
+        on_training_objects = split == SPLITS[0]
+        if not set(metrics) & ({"policy"} if on_training_objects else {"downstream", "priors"}):
+            continue
         try:
             env = converted.env(split, task, impl, settings.env, settings.physics)
         except DataError as e:
             report(f"{split} left out: {e}", 1, 1, {})
             continue
         kd, kp = jax.random.split(jax.random.fold_in(key, number))
+        if on_training_objects:
+            result["policy"].append(_evaluate_policy(folder, env, settings, trials, kp, report))
+            continue
         if "downstream" in metrics:
-            rows += evaluate_split(split, env, priors, methods, trials, settings.evaluation.proposals, kd, report)
+            proposals = settings.evaluation.proposals
+            result["downstream"] += evaluate_split(split, env, priors, methods, trials, proposals, kd, report)
         if "priors" in metrics:
-            scores.append({"split": split, **_priors_split(folder, env, priors, settings, kp, split, report)})
-    if not rows and not scores:
-        raise UserError(f"{converted.folder}: has no test object for task {task.name}; see splits.json")
-    return {"run": str(folder), "task": task.name, "seed": seed, "downstream": rows, "priors": scores}
+            scores = _priors_split(folder, env, priors, settings, kp, split, report)
+            result["priors"].append({"split": split, **scores})
+    if not any(result[name] for name in METRICS):
+        raise UserError(f"{converted.folder}: has no object to evaluate task {task.name} on; see splits.json")
+    return result
 
 
 def evaluate_split(
@@ -113,7 +125,7 @@ def evaluate_split(
             trial = ProposalTrials(env, clouds, priors.networks, proposals)
             method = _ours(trial, priors)
         elif name == "expert":
-            method = partial(run_expert, env)
+            method = lambda start, key: (run_expert(env, start, key), None)  # noqa: E731
         else:
             method = random_method(env)
         label = f"evaluate {name} on {split}"
@@ -124,20 +136,18 @@ def evaluate_split(
 
 
 def _ours(trial: ProposalTrials, priors: Priors) -> Method:
-    return lambda start, key: trial.best(priors.params, start, key)[0]
+    def run(start, key):
+        final, _, score = trial.best(priors.params, start, key)
+        return final, score
+
+    return run
 
 
 def _priors_split(
     folder: Path, env: Env, priors: Priors, settings: Settings, key: jax.Array, split: str, report: Report
 ) -> dict[str, float]:
     explorer = Explorer(env, settings.explore)
-    path = folder / "policy.msgpack"
-    try:
-        policy = serialization.from_bytes(explorer.init(key).td3.policy, path.read_bytes())
-    except (OSError, ValueError, KeyError, TypeError) as e:
-        raise UserError(
-            f"{path}: cannot be read ({str(e).splitlines()[0]}); finish the run, or leave out --metrics priors"
-        ) from e
+    policy = _policy(folder, explorer)
     kl, km = jax.random.split(key)
     report(f"label trajectories on {split}", 0, 1, {})
     positive, negative = labelled(explorer, policy, _LABELLED, kl)
@@ -151,33 +161,81 @@ def _priors_split(
     return result
 
 
+def _policy(folder: Path, explorer: Explorer) -> Any:
+    """The parameters of a run's policy."""
+    path = folder / "policy.msgpack"
+    try:
+        return serialization.from_bytes(explorer.init(jax.random.key(0)).td3.policy, path.read_bytes())
+    except (OSError, ValueError, KeyError, TypeError) as e:
+        raise UserError(
+            f"{path}: cannot be read ({str(e).splitlines()[0]}); finish the run, or leave out --metrics priors, policy"
+        ) from e
+
+
+def _evaluate_policy(
+    folder: Path, env: Env, settings: Settings, trials: int, key: jax.Array, report: Report
+) -> dict[str, Any]:
+    """Success of the policy on the objects it was trained on: fresh starts that are free and, when pulling, hold.
+
+    Trials stop at success, as in the paper; a part that is let go is a failure. Consumes the key.
+    """
+    explorer = Explorer(env, settings.explore)
+    policy = _policy(folder, explorer)
+    k_pool, k_run = jax.random.split(key)
+    say = lambda done: report("policy's starts", done, trials, {})  # noqa: E731
+    pool = start_pool(env, k_pool, trials, say)
+    wins = []
+    for batch in range(-(-trials // env.config.batch)):
+        final, _ = explorer.run(policy, pool, jax.random.fold_in(k_run, batch), 0.0, 0.0)
+        wins.append(np.asarray(final.success))
+    won = np.concatenate(wins)[:trials]
+    interval = [float(x) for x in wilson_interval(int(won.sum()), trials)]
+    return {"split": "train", "success": float(won.mean()), "trials": trials, "ci95": interval}
+
+
 def markdown(rows: Sequence[dict[str, Any]]) -> str:
-    """The table of downstream success, one line per task, method and split."""
+    """The table of downstream success, one line per task, method and split. `said` is the mean of its own scores."""
     lines = [
-        "| task | method | split | success | 95% interval | any waypoint | start in collision | trials |",
-        "|---|---|---|---|---|---|---|---|",
+        "| task | method | split | success | 95% interval | said | any waypoint | start in collision | trials |",
+        "|---|---|---|---|---|---|---|---|---|",
     ]
     for row in rows:
         low, high = row["ci95"]
+        said = f"{row['said']:.1%}" if "said" in row else "-"
         lines.append(
             f"| {row['task']} | {row['method']} | {row['split']} | {row['success']:.1%} | {low:.1%} to {high:.1%} "
-            f"| {row['success_any_waypoint']:.1%} | {row['in_collision']:.1%} | {row['trials']} |"
+            f"| {said} | {row['success_any_waypoint']:.1%} | {row['in_collision']:.1%} | {row['trials']} |"
         )
     return "\n".join(lines)
 
 
 def _tables(runs: Sequence[dict[str, Any]]) -> str:
-    rows = [{"task": run["task"], **row} for run in runs for row in run["downstream"]]
-    parts = [markdown(rows)] if rows else []
-    scores = [(run["task"], row) for run in runs for row in run["priors"] if row["positives"]]
+    rows = {name: [{"task": run["task"], **row} for run in runs for row in run[name]] for name in METRICS}
+    parts = [markdown(rows["downstream"])] if rows["downstream"] else []
+    scores = [row for row in rows["priors"] if row["positives"]]
     if scores:
         names = ("accuracy", "precision", "recall", "f_score", "coverage")
         lines = [f"| task | split | {' | '.join(names)} |", "|---" * (2 + len(names)) + "|"]
-        lines += [f"| {t} | {row['split']} | " + " | ".join(f"{row[n]:.1%}" for n in names) + " |" for t, row in scores]
+        for row in scores:
+            lines.append(f"| {row['task']} | {row['split']} | " + " | ".join(f"{row[n]:.1%}" for n in names) + " |")
+        parts.append("\n".join(lines))
+    if rows["policy"]:
+        lines = ["| task | policy's success on training objects | 95% interval | trials |", "|---|---|---|---|"]
+        for row in rows["policy"]:
+            low, high = row["ci95"]
+            lines.append(f"| {row['task']} | {row['success']:.1%} | {low:.1%} to {high:.1%} | {row['trials']} |")
         parts.append("\n".join(lines))
     return "\n\n".join(parts)
 
 
 def _write(folder: Path, everything: dict[str, Any]) -> None:
+    curves = {
+        f"{run['task']}, {row['split']}": row["reliability"]
+        for run in everything["runs"]
+        for row in run["downstream"]
+        if "reliability" in row
+    }
+    if curves:
+        reliability_curves(curves, folder / "reliability.png")
     write_json(folder / "evaluation.json", everything)
     write_text(folder / "evaluation.md", _tables(everything["runs"]) + "\n")

@@ -20,6 +20,12 @@ class Reliability(NamedTuple):
     gap: float  # |mean score - share of positives|, over all rows
     expected_error: float  # mean over rows of their bin's |said - happened| (ECE)
 
+    def to_json(self) -> dict[str, Any]:
+        """Its filled bins, and both errors."""
+        filled = self.count > 0
+        curve = {name: getattr(self, name)[filled].round(4).tolist() for name in ("said", "happened", "count")}
+        return curve | {"gap": self.gap, "expected_error": self.expected_error}
+
 
 def scorer_metrics(scores: np.ndarray, labels: np.ndarray, threshold: float = 0.5) -> dict[str, float]:
     """Accuracy (mean of the two classes' recalls), precision, recall and F-score of the positives.

@@ -58,8 +58,8 @@ def priors_metrics(
     key: jax.Array,
     runs: int = 10,
     proposals: int = 100,
-) -> dict[str, float]:
-    """Accuracy, precision, recall, F-score of the scorer and coverage of the proposals (paper, appendix E.1).
+) -> dict[str, Any]:
+    """Accuracy, precision, recall, F-score and reliability of the scorer, coverage of the proposals (appendix E.1).
 
     Coverage is the mean of `runs` draws of `proposals` trajectories per positive. Consumes the key.
     """
@@ -68,7 +68,8 @@ def priors_metrics(
     )
     p, n = score(positive), score(negative)
     labels = np.concatenate([np.ones(len(p)), np.zeros(len(n))])
-    result = m.scorer_metrics(np.concatenate([p, n]), labels)
+    scores = np.concatenate([p, n])
+    result = {**m.scorer_metrics(scores, labels), "reliability": m.reliability(scores, labels).to_json()}
     covered = []
     for run in range(runs):
         proposed, _ = propose_trajectories(

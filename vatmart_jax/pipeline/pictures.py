@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from typing import Any
 
 import jax.numpy as jnp
 import matplotlib
@@ -44,6 +45,19 @@ def curves(metrics: Path, out: Path) -> None:
     for axis in np.ravel(axes)[len(panels) :]:
         axis.axis("off")
     figure.tight_layout()
+    _save(figure, out)
+
+
+def reliability_curves(curves: dict[str, dict[str, Any]], out: Path) -> None:
+    """What was said against what happened, one line per name; dots grow with the number of trials."""
+    figure, axis = plt.subplots(figsize=(5.2, 5))
+    axis.plot([0, 1], [0, 1], "--", color="#999999", lw=1)
+    for name, curve in curves.items():
+        (line,) = axis.plot(curve["said"], curve["happened"], label=f"{name} (gap {curve['gap']:.2f})")
+        axis.scatter(curve["said"], curve["happened"], s=np.array(curve["count"]), color=line.get_color(), alpha=0.5)
+    axis.set(xlabel="score", ylabel="success", xlim=(0, 1), ylim=(0, 1))
+    axis.legend(fontsize=8)
+    axis.grid(alpha=0.3)
     _save(figure, out)
 
 
