@@ -5,15 +5,22 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy.spatial import ConvexHull
-from test_physics import APPROACH, BATCH, STEPS, Pushes, assert_bitwise
+from test_physics import (  # noqa: F401  its tests hold for this module's `doors`, too
+    APPROACH,
+    BATCH,
+    EVERYONE,
+    STEPS,
+    Pushes,
+    assert_bitwise,
+    test_bad_controls_mark_only_their_simulation_and_never_spread,
+    test_inactive_simulations_stay_bitwise_the_same,
+)
 
 from vatmart_jax.bank import HINGE, SceneBank
 from vatmart_jax.physics import PhysicsConfig, make_physics
 from vatmart_jax.physics.c import CPhysics
 from vatmart_jax.physics.mjx import MjxPhysics, Slots, _nearest
 from vatmart_jax.physics.template import PART
-
-EVERYONE = np.ones(BATCH, bool)
 
 
 class MjxPushes(Pushes):
@@ -72,28 +79,13 @@ def test_hands_inside_an_object_are_in_contact_from_the_start(doors):
         np.testing.assert_array_equal(doors.reset(*start).in_contact, doors.c.reset(*start).in_contact)
 
 
-def test_inactive_simulations_stay_bitwise_the_same(doors):
-    before, active = doors.pushed(), np.arange(BATCH) % 3 != 0
-    after = doors.rollout(before, doors.controls(1), active)
-    assert_bitwise(after, before, ~active)
-    assert (np.asarray(after.qpos)[active] != np.asarray(before.qpos)[active]).any(1).all()
-    assert_bitwise(after, doors.rollout(before, doors.controls(1), EVERYONE), active)
-
-
-@pytest.mark.parametrize("bad", [np.nan, np.inf, 1e30])
-def test_bad_controls_mark_only_their_simulation_and_never_spread(doors, bad):
+def test_controls_that_are_merely_hard_do_not_spread(doors):
     before, ctrl = doors.pushed(), doors.controls(1)
     sound = doors.rollout(before, ctrl, EVERYONE)
-    ctrl[2, STEPS // 2, 3] = bad
+    ctrl[2, STEPS // 2, 3] = 1e30  # the actuator's force is limited
     after = doors.rollout(before, ctrl, EVERYONE)
     assert_bitwise(after, sound, np.arange(BATCH) != 2)
     assert all(np.isfinite(leaf).all() for leaf in (after.qpos, after.qvel))
-    if np.isfinite(bad):  # the actuator's force is limited, so this one is merely hard
-        return
-    np.testing.assert_array_equal(after.diverged, np.arange(BATCH) == 2)
-    assert_bitwise(after.replace(diverged=before.diverged), before, [2])
-    again = doors.rollout(after, doors.controls(2), EVERYONE)
-    assert_bitwise(again, after, [2])
 
 
 def test_bad_starts_are_marked_and_stay_as_they_are(doors):

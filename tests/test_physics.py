@@ -16,6 +16,7 @@ from vatmart_jax.physics.controller import hand_target, waypoint_controls
 from vatmart_jax.physics.template import FINGER_OPEN, HAND, N_CTRL, N_QPOS, PART, TIP, scene_model, template
 
 BATCH, STEPS = 8, 60
+EVERYONE = np.ones(BATCH, bool)
 APPROACH = N_CTRL - 6  # the hand's z
 
 
@@ -55,7 +56,7 @@ class Pushes:
     def pushed(self, seed: int = 0, rollouts: int = 1) -> PhysicsState:
         state = self.reset(*self.starts(seed))
         for k in range(rollouts):
-            state = self.rollout(state, self.controls(seed + k), np.ones(BATCH, bool))
+            state = self.rollout(state, self.controls(seed + k), EVERYONE)
         return state
 
 
@@ -114,21 +115,20 @@ def test_inactive_simulations_stay_bitwise_the_same(doors):
     after = doors.rollout(before, doors.controls(1), active)
     assert_bitwise(after, before, ~active)
     assert (np.asarray(after.qpos)[active] != np.asarray(before.qpos)[active]).any(1).all()
-    everyone = doors.rollout(before, doors.controls(1), np.ones(BATCH, bool))
-    assert_bitwise(after, everyone, active)
+    assert_bitwise(after, doors.rollout(before, doors.controls(1), EVERYONE), active)
 
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf])
 def test_bad_controls_mark_only_their_simulation_and_never_spread(doors, bad):
     before, ctrl = doors.pushed(), doors.controls(1)
-    sound = doors.rollout(before, ctrl, np.ones(BATCH, bool))
+    sound = doors.rollout(before, ctrl, EVERYONE)
     ctrl[2, STEPS // 2, 3] = bad
-    after = doors.rollout(before, ctrl, np.ones(BATCH, bool))
+    after = doors.rollout(before, ctrl, EVERYONE)
     np.testing.assert_array_equal(after.diverged, np.arange(BATCH) == 2)
     assert_bitwise(after, sound, np.arange(BATCH) != 2)
     assert_bitwise(after.replace(diverged=before.diverged), before, [2])
     # It stays as it is, whatever comes.
-    again = doors.rollout(after, doors.controls(2), np.ones(BATCH, bool))
+    again = doors.rollout(after, doors.controls(2), EVERYONE)
     assert_bitwise(again, after, [2])
     assert all(np.isfinite(leaf).all() for leaf in (again.qpos, again.qvel))
 
@@ -139,15 +139,14 @@ def test_a_simulation_that_blows_up_is_marked_and_its_place_is_as_new_afterwards
     bad_qpos[1, 4] = np.nan
     bad_pose[4, 0] = np.nan
     begun = doors.reset(scene, bad_pose, bad_qpos)
-    state = doors.rollout(begun, doors.controls(), np.ones(BATCH, bool))
+    state = doors.rollout(begun, doors.controls(), EVERYONE)
     np.testing.assert_array_equal(begun.diverged, state.diverged)
     np.testing.assert_array_equal(state.diverged, np.isin(np.arange(BATCH), [1, 4]))
     sound = doors.pushed()
     assert_bitwise(state, sound, ~np.asarray(state.diverged))
     # A fresh pool has never seen a NaN.
     fresh = CPhysics(doors.bank, PhysicsConfig())
-    ones = np.ones(BATCH, bool)
-    assert_bitwise(sound, fresh.rollout(fresh.reset(scene, pose, qpos), doors.controls(), ones))
+    assert_bitwise(sound, fresh.rollout(fresh.reset(scene, pose, qpos), doors.controls(), EVERYONE))
 
 
 def test_divergence_is_noticed_every_time_and_said_nowhere_else(doors, tmp_path, monkeypatch, capfd):
@@ -158,7 +157,7 @@ def test_divergence_is_noticed_every_time_and_said_nowhere_else(doors, tmp_path,
     mujoco.set_mju_user_warning(mine)
     try:
         for seed in range(3):
-            state = doors.rollout(doors.reset(scene, pose, qpos), doors.controls(seed), np.ones(BATCH, bool))
+            state = doors.rollout(doors.reset(scene, pose, qpos), doors.controls(seed), EVERYONE)
             np.testing.assert_array_equal(state.diverged, np.isin(np.arange(BATCH), [4, 5]))
         assert mujoco.get_mju_user_warning() is mine
     finally:
@@ -167,24 +166,29 @@ def test_divergence_is_noticed_every_time_and_said_nowhere_else(doors, tmp_path,
     assert capfd.readouterr().err == ""
 
 
-def test_ten_rollouts_with_changing_scenes_compile_once(cabinets):
-    pushes, traces = Pushes(cabinets, HINGE), 0
+def test_ten_rollouts_with_changing_scenes_compile_once(doors):
+    traces = 0
 
     @jax.jit
     def trial(scene, pose, qpos, ctrl):
         nonlocal traces
         traces += 1
-        state = pushes.physics.reset(scene, pose, qpos)
-        state, _ = jax.lax.scan(lambda s, c: (pushes.physics.rollout(s, c, ~s.diverged), None), state, ctrl)
+        state = doors.physics.reset(scene, pose, qpos)
+        state, _ = jax.lax.scan(lambda s, c: (doors.physics.rollout(s, c, ~s.diverged), None), state, ctrl)
         return state.qpos
 
     seen = set()
     for seed in range(10):
-        starts = pushes.starts(seed)
+        starts = doors.starts(seed)
         seen.add(tuple(starts[0].tolist()))
-        assert np.isfinite(trial(*starts, pushes.controls(seed)[None].repeat(2, 0))).all()
+        found = trial(*starts, doors.controls(seed)[None].repeat(2, 0))
+        assert np.isfinite(found).all()
     assert len(seen) == 10
     assert (traces, trial._cache_size()) == (1, 1)
+    alone = doors.reset(*starts)
+    for _ in range(2):
+        alone = doors.rollout(alone, doors.controls(9), EVERYONE)
+    np.testing.assert_array_equal(found, alone.qpos)
 
 
 def test_vmap_over_a_leading_axis_equals_separate_calls(doors):
@@ -224,7 +228,7 @@ def test_parts_have_the_configured_inertia_and_stay_within_their_range(cabinets)
         ctrl[..., APPROACH] = 1.0  # far behind the closed part
         state = pushes.reset(scene, pose, qpos)
         for _ in range(4):
-            state = pushes.rollout(state, ctrl, np.ones(BATCH, bool))
+            state = pushes.rollout(state, ctrl, EVERYONE)
         assert (state.qpos[:, PART] > -margin).all()
         assert (state.qpos[:, PART] < pushes.bank.width[scene] + margin).all()
 
@@ -257,7 +261,7 @@ def test_the_free_hand_arrives_within_a_waypoint(doors):
     ctrl = waypoint_controls(jnp.zeros((BATCH, N_CTRL)), jnp.asarray(target), config)
     assert ctrl.shape == (BATCH, config.steps_per_waypoint, N_CTRL)
     np.testing.assert_allclose(ctrl[:, -1], target, atol=1e-6)
-    state = doors.rollout(doors.reset(scene, pose, qpos), ctrl, np.ones(BATCH, bool))
+    state = doors.rollout(doors.reset(scene, pose, qpos), ctrl, EVERYONE)
     np.testing.assert_allclose(state.qpos[:, HAND], target[:, :6], atol=1e-3)
     np.testing.assert_allclose(state.qpos[:, 7:], target[:, 6:], atol=1e-3)
     np.testing.assert_array_equal(state.qpos[:, PART], qpos[:, PART])
@@ -280,5 +284,5 @@ def test_halving_the_time_step_hardly_moves_the_part(cabinets):
         config = replace(PhysicsConfig(), timestep=0.004 / share)
         physics = CPhysics(pushes.bank, config)
         state = physics.reset(*pushes.starts())
-        moved.append(physics.rollout(state, pushes.controls().repeat(share, 1), np.ones(BATCH, bool)).qpos[:, PART])
+        moved.append(physics.rollout(state, pushes.controls().repeat(share, 1), EVERYONE).qpos[:, PART])
     assert np.median(np.abs(moved[0] - moved[1])) < 5e-3

@@ -4,10 +4,18 @@ import sys
 from dataclasses import replace
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
-from test_physics import BATCH, STEPS, Pushes, assert_bitwise
+from test_physics import (  # noqa: F401  its tests hold for this module's `doors`, too
+    BATCH,
+    EVERYONE,
+    Pushes,
+    assert_bitwise,
+    test_bad_controls_mark_only_their_simulation_and_never_spread,
+    test_inactive_simulations_stay_bitwise_the_same,
+    test_ten_rollouts_with_changing_scenes_compile_once,
+    test_vmap_over_a_leading_axis_equals_separate_calls,
+)
 
 from vatmart_jax.bank import HINGE, SLIDE
 from vatmart_jax.errors import UserError
@@ -15,7 +23,6 @@ from vatmart_jax.physics import PhysicsConfig, make_physics
 from vatmart_jax.physics.template import PART
 
 warp = pytest.importorskip("vatmart_jax.physics.warp", exc_type=ImportError)
-EVERYONE = np.ones(BATCH, bool)
 
 
 class WarpPushes(Pushes):
@@ -64,25 +71,6 @@ def test_the_state_carries_everything_from_call_to_call(doors):
     assert_bitwise(whole, half)
 
 
-def test_inactive_simulations_stay_bitwise_the_same_and_others_do_not_notice(doors):
-    before, active = doors.pushed(), np.arange(BATCH) % 3 != 0
-    after = doors.rollout(before, doors.controls(1), active)
-    assert_bitwise(after, before, ~active)
-    assert_bitwise(after, doors.rollout(before, doors.controls(1), EVERYONE), active)
-
-
-@pytest.mark.parametrize("bad", [np.nan, np.inf])
-def test_bad_controls_mark_only_their_simulation_which_keeps_its_state(doors, bad):
-    before, ctrl = doors.pushed(), doors.controls(1)
-    sound = doors.rollout(before, ctrl, EVERYONE)
-    ctrl[2, STEPS // 2, 3] = bad
-    after = doors.rollout(before, ctrl, EVERYONE)
-    np.testing.assert_array_equal(after.diverged, np.arange(BATCH) == 2)
-    assert_bitwise(after, sound, np.arange(BATCH) != 2)
-    assert_bitwise(after.replace(diverged=before.diverged), before, [2])
-    assert_bitwise(doors.rollout(after, doors.controls(2), EVERYONE), after, [2])
-
-
 def test_simulations_that_blow_up_are_marked_and_never_touch_others(doors):
     scene, pose, qpos = doors.starts()
     sound = doors.rollout(doors.reset(scene, pose, qpos), doors.controls(), EVERYONE)
@@ -120,43 +108,6 @@ def test_contacts_without_room_are_divergence_from_the_start_on(cabinets, monkey
     assert not pushes.reset(scene, pose, qpos).diverged.any()
     pose[:, :3] = pushes.bank.part_pos[scene]
     assert pushes.reset(scene, pose, qpos).diverged.all()
-
-
-def test_ten_rollouts_with_changing_scenes_compile_once(doors):
-    traces = 0
-
-    @jax.jit
-    def trial(scene, pose, qpos, ctrl):
-        nonlocal traces
-        traces += 1
-        state = doors.physics.reset(scene, pose, qpos)
-        state, _ = jax.lax.scan(lambda s, c: (doors.physics.rollout(s, c, ~s.diverged), None), state, ctrl)
-        return state.qpos
-
-    seen = set()
-    for seed in range(10):
-        starts = doors.starts(seed)
-        seen.add(tuple(starts[0].tolist()))
-        found = trial(*starts, doors.controls(seed)[None].repeat(2, 0))
-        assert np.isfinite(found).all()
-    assert len(seen) == 10
-    assert (traces, trial._cache_size()) == (1, 1)
-    alone = doors.reset(*starts)
-    for _ in range(2):
-        alone = doors.rollout(alone, doors.controls(9), EVERYONE)
-    np.testing.assert_array_equal(found, alone.qpos)
-
-
-def test_vmap_over_a_leading_axis_equals_separate_calls(doors):
-    states = [doors.reset(*doors.starts(seed)) for seed in (0, 1)]
-    both = jax.vmap(doors.physics.reset)(*map(np.stack, zip(doors.starts(0), doors.starts(1), strict=True)))
-    ctrl, active = np.stack([doors.controls(0), doors.controls(1)]), np.ones((2, BATCH), bool)
-    both = jax.jit(jax.vmap(doors.physics.rollout))(both, ctrl, active)
-    for k in (0, 1):
-        assert_bitwise(jax.tree.map(lambda x, k=k: x[k], both), doors.rollout(states[k], ctrl[k], active[k]))
-    one_start = jax.vmap(doors.physics.rollout, (None, 0, None))(states[0], jnp.asarray(ctrl), jnp.asarray(active[0]))
-    for k in (0, 1):
-        assert_bitwise(jax.tree.map(lambda x, k=k: x[k], one_start), doors.rollout(states[0], ctrl[k], active[k]))
 
 
 def test_without_the_package_the_error_names_the_extra(cabinets, monkeypatch):
