@@ -21,7 +21,7 @@ import tyro
 
 from vatmart_jax import geometry as g
 from vatmart_jax.bank import SceneBank, ViewBank
-from vatmart_jax.bench import device, random_trials
+from vatmart_jax.bench import Choice, device, random_trials
 from vatmart_jax.env import TASKS, Env, EnvConfig, EnvState, Start
 from vatmart_jax.expert import run_expert
 from vatmart_jax.files import write_json
@@ -168,9 +168,7 @@ def study(args: Study, name: str, bank: SceneBank, views: ViewBank) -> dict[str,
 
 def main(args: Study) -> None:
     begun = time.monotonic()
-    bank, views = SceneBank.load(args.data / "scenes.npz"), ViewBank.load(args.data / "views.npz")
-    chosen = np.flatnonzero(bank.split == args.split)
-    bank, views = bank.select(chosen), views.of_scenes(chosen)
+    bank, views = Choice(args.data, args.split).banks(args.seed)
     result: dict[str, Any] = {
         "trials_per_task": args.trials, "split": args.split, "collision": bank.collision, "seed": args.seed,
         "device": device(),
