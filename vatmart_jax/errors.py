@@ -19,6 +19,11 @@ def at_least_one(flag: str, value: int) -> None:
         raise UserError(f"{flag} {value}: must be at least 1")
 
 
+def first_line(error: Exception) -> str:
+    """What another's error says, or its type where it says nothing."""
+    return (str(error) or type(error).__name__).splitlines()[0]
+
+
 class OpenGLError(UserError):
     """MuJoCo finds no OpenGL to draw with, either on import or when a renderer is made."""
 

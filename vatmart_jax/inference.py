@@ -22,7 +22,7 @@ import trimesh
 from flax import serialization
 
 from vatmart_jax.config import from_json, to_json
-from vatmart_jax.errors import UserError, at_least_one
+from vatmart_jax.errors import UserError, at_least_one, first_line
 from vatmart_jax.files import whole, whole_folder, write_json
 from vatmart_jax.perception.networks import Features, Networks, NetworksConfig, Params
 from vatmart_jax.perception.pointnet2 import group
@@ -92,7 +92,7 @@ class Priors:
         try:
             params: Any = serialization.msgpack_restore(file.read_bytes())
         except Exception as e:  # whatever msgpack and NumPy raise on damaged bytes
-            raise PriorsError(f"{file}: cannot be read ({_first_line(e)}); train or export the priors again") from e
+            raise PriorsError(f"{file}: cannot be read ({first_line(e)}); train or export the priors again") from e
         expected = jax.eval_shape(Networks(config.networks).init, jax.random.key(0))
         wrong = _difference(expected, params)
         if wrong:
@@ -176,7 +176,7 @@ def read_cloud(path: Path) -> np.ndarray:
     except FileNotFoundError:
         raise PriorsError(f"{path}: no such file") from None
     except Exception as e:  # whatever the readers raise on damaged bytes
-        raise PriorsError(f"{path}: cannot be read ({_first_line(e)})") from e
+        raise PriorsError(f"{path}: cannot be read ({first_line(e)})") from e
     if points.dtype.kind not in "fiu" or points.ndim != 2 or points.shape[1] != 3 or not len(points):
         raise PriorsError(f"{path}: expected numbers [N, 3], found {points.dtype} {points.shape}")
     points = points.astype(np.float32)
@@ -190,7 +190,7 @@ def read_mask(path: Path, count: int) -> np.ndarray:
     try:
         mask = np.load(path, allow_pickle=False)
     except (OSError, EOFError, ValueError) as e:
-        raise PriorsError(f"{path}: cannot be read ({_first_line(e)}); expected a .npy file of booleans") from e
+        raise PriorsError(f"{path}: cannot be read ({first_line(e)}); expected a .npy file of booleans") from e
     if mask.shape != (count,) or mask.dtype.kind not in "bui" or not mask.any():
         raise PriorsError(
             f"{path}: expected {count} booleans, one of them true at least; found {mask.dtype} {mask.shape}"
@@ -224,7 +224,7 @@ def _read_config(path: Path) -> PriorsConfig:
             raise ValueError(f"not of format {FORMAT}")
         return from_json(PriorsConfig, found)
     except (OSError, ValueError, TypeError) as e:
-        raise PriorsError(f"{path}: not a config of priors ({_first_line(e)}); train or export them again") from e
+        raise PriorsError(f"{path}: not a config of priors ({first_line(e)}); train or export them again") from e
 
 
 def _difference(expected: Any, found: Any) -> str:
@@ -241,7 +241,3 @@ def _difference(expected: Any, found: Any) -> str:
         if not np.isfinite(value).all():
             return f"parameter {name} is not finite"
     return ""
-
-
-def _first_line(error: Exception) -> str:
-    return (str(error) or type(error).__name__).splitlines()[0]

@@ -19,7 +19,7 @@ from jax.experimental import io_callback
 from vatmart_jax import geometry as g
 from vatmart_jax.bank import HINGE, SceneBank, ViewBank
 from vatmart_jax.env import TASKS, Env, EnvConfig, EnvState, Start, Task
-from vatmart_jax.errors import OpenGLError, UserError, one_of
+from vatmart_jax.errors import OpenGLError, UserError, first_line, one_of
 from vatmart_jax.expert import run_expert
 from vatmart_jax.files import whole
 from vatmart_jax.inference import Priors
@@ -134,7 +134,7 @@ def _given(env: Env, start: Start, file: Path, contact: tuple[float, float, floa
     try:
         numbers = np.load(file, allow_pickle=False)
     except (OSError, ValueError, EOFError) as e:
-        raise UserError(f"{file}: not a .npy file ({str(e).splitlines()[0]}); give {g.TRAJECTORY} numbers") from e
+        raise UserError(f"{file}: not a .npy file ({first_line(e)}); give {g.TRAJECTORY} numbers") from e
     if not isinstance(numbers, np.ndarray) or numbers.shape != (g.TRAJECTORY,) or numbers.dtype.kind not in "fiu":
         found = f"shape {numbers.shape}" if isinstance(numbers, np.ndarray) else "an archive"
         raise UserError(f"{file}: expected {g.TRAJECTORY} numbers, found {found}; see geometry.pack_trajectory")

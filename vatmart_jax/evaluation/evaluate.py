@@ -14,7 +14,7 @@ from flax import serialization
 from vatmart_jax.config import from_json
 from vatmart_jax.data import SPLITS, Data, DataError
 from vatmart_jax.env import TASKS, Env
-from vatmart_jax.errors import UserError, one_of
+from vatmart_jax.errors import UserError, at_least_one, first_line, one_of
 from vatmart_jax.evaluation.downstream import Method, downstream, random_method
 from vatmart_jax.evaluation.metrics import wilson_interval
 from vatmart_jax.evaluation.priors import labelled, priors_metrics
@@ -58,8 +58,7 @@ def evaluate(
         for name in given:
             one_of(flag, name, known)
     one_of("--impl", impl, IMPLS)
-    if trials < 1:
-        raise UserError(f"--trials {trials}: must be at least 1")
+    at_least_one("--trials", trials)
     begun = time.monotonic()
     evaluated = []
     for folder in runs:
@@ -168,7 +167,7 @@ def _policy(folder: Path, explorer: Explorer) -> Any:
         return serialization.from_bytes(explorer.init(jax.random.key(0)).td3.policy, path.read_bytes())
     except (OSError, ValueError, KeyError, TypeError) as e:
         raise UserError(
-            f"{path}: cannot be read ({str(e).splitlines()[0]}); finish the run, or leave out --metrics priors, policy"
+            f"{path}: cannot be read ({first_line(e)}); finish the run, or leave out --metrics priors, policy"
         ) from e
 
 

@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 import orbax.checkpoint as ocp
 
-from vatmart_jax.errors import UserError
+from vatmart_jax.errors import UserError, first_line
 from vatmart_jax.files import write_json, write_text
 
 
@@ -67,7 +67,7 @@ class Run:
             try:
                 found = self._checkpoints.restore(step, args=ocp.args.StandardRestore(like))
             except (ValueError, KeyError, OSError, TypeError) as e:
-                problems.append(f"{step}: {str(e).splitlines()[0][:120]}")
+                problems.append(f"{step}: {first_line(e)[:120]}")
                 self._checkpoints.delete(step)
                 continue
             self._truncate(int(found["lines"]))
