@@ -156,7 +156,7 @@ def _evaluate(argv: list[str]) -> None:
         """Evaluate trained priors on test shapes and unseen categories."""
 
         run: Positional[tuple[Path, ...]]
-        """run folders of `vatmart train`"""
+        """run folders of `vatmart train`, or names of pretrained priors, such as push-door"""
         data: Path | None = None
         """default: the data that the run was trained on"""
         metrics: str = "priors,downstream"
@@ -212,7 +212,7 @@ def _play(argv: list[str]) -> None:
         amount: float | None = None
         """how far to move the part, rad or unit lengths; default random"""
         run: Path | None = None
-        """a run folder of `vatmart train`: the best proposal of its priors"""
+        """a run folder of `vatmart train`, or the name of pretrained priors: their best proposal"""
         trajectory: Path | None = None
         """a .npy file of 30 numbers: 6D rotation of the start pose, then four residual waypoints"""
         contact: tuple[float, float, float] | None = None
@@ -236,14 +236,14 @@ def _play(argv: list[str]) -> None:
     _enable_compilation_cache()
     from vatmart_jax.pipeline.run import read_config
     from vatmart_jax.play import animate, play, show
+    from vatmart_jax.pretrained import run_folder
     from vatmart_jax.progress import Bars
 
-    of_run = read_config(args.run)["data"] if args.run else None
+    run = run_folder(args.run) if args.run else None
+    of_run = read_config(run)["data"] if run else None
     with Bars() as bars:
         folder = _prepared(args.data or (Path(of_run) if of_run else None), bars.say)
-    recording, result = play(
-        folder, args.scene, args.task, args.amount, args.trajectory, args.contact, args.run, args.seed
-    )
+    recording, result = play(folder, args.scene, args.task, args.amount, args.trajectory, args.contact, run, args.seed)
     if args.viewer:
         show(recording)
     else:
@@ -355,7 +355,7 @@ def _predict(argv: list[str]) -> None:
         """Where to touch a partial point cloud for a task, which trajectories to try, and how likely each works."""
 
         priors: Positional[Path]
-        """run folder of `vatmart train`, or a folder of priors"""
+        """run folder of `vatmart train`, a folder of priors, or the name of pretrained ones, such as push-door"""
         cloud: Path
         """.npy [N, 3] or .ply: z up, the object's front towards -x, unit lengths"""
         task: str
@@ -371,8 +371,9 @@ def _predict(argv: list[str]) -> None:
     args = tyro.cli(Predict, args=argv, prog="vatmart predict")
     _enable_compilation_cache()
     from vatmart_jax.inference import Priors, amount, read_cloud, read_mask
+    from vatmart_jax.pretrained import run_folder
 
-    priors = Priors.load(args.priors)
+    priors = Priors.load(run_folder(args.priors))
     points = read_cloud(args.cloud)
     mask = None if args.mask is None else read_mask(args.mask, len(points))
     import jax
@@ -403,7 +404,7 @@ def _export(argv: list[str]) -> None:
         """Write the priors of a run into a folder that needs nothing else."""
 
         run: Positional[Path]
-        """run folder of `vatmart train`, or a folder of priors"""
+        """run folder of `vatmart train`, a folder of priors, or the name of pretrained ones, such as push-door"""
         out: Path
         format: str = "flax,stablehlo"
         """flax (loads with Priors.load), stablehlo (loads with jax.export.deserialize), or both"""
@@ -414,8 +415,9 @@ def _export(argv: list[str]) -> None:
     args = tyro.cli(Export, args=argv, prog="vatmart export")
     from vatmart_jax.export import export
     from vatmart_jax.inference import Priors
+    from vatmart_jax.pretrained import run_folder
 
-    files = export(Priors.load(args.run), args.out, tuple(args.format.split(",")), args.proposals)
+    files = export(Priors.load(run_folder(args.run)), args.out, tuple(args.format.split(",")), args.proposals)
     _print_result({"files": [str(f) for f in files]}, args.json)
 
 

@@ -28,6 +28,7 @@ from vatmart_jax.pipeline.explore import Explorer, start_pool
 from vatmart_jax.pipeline.pictures import reliability_curves
 from vatmart_jax.pipeline.run import read_config
 from vatmart_jax.presets import Settings
+from vatmart_jax.pretrained import run_folder
 
 METHODS = ("ours", "random", "expert")
 METRICS = ("priors", "downstream", "policy")
@@ -50,9 +51,9 @@ def evaluate(
 ) -> tuple[dict[str, Any], str]:
     """Evaluate finished runs on test shapes and unseen categories; returns the JSON and a Markdown table.
 
-    prepared: the converted folder of a --data; data: overrides what a run was trained on. Writes evaluation.json,
-    evaluation.md and reliability.png into `out`, or into each run's folder. Raises UserError for what cannot be
-    evaluated.
+    runs: folders, or names of pretrained priors. prepared: the converted folder of a --data; data: overrides what a
+    run was trained on. Writes evaluation.json, evaluation.md and reliability.png into `out`, or into each run's folder
+    (nowhere for pretrained ones). Raises UserError for what cannot be evaluated.
     """
     for flag, given, known in (("--metrics", metrics, METRICS), ("--methods", methods, METHODS)):
         for name in given:
@@ -61,11 +62,13 @@ def evaluate(
     at_least_one("--trials", trials)
     begun = time.monotonic()
     evaluated = []
-    for folder in runs:
-        result = _evaluate_run(Path(folder), prepared, data, metrics, methods, trials, impl, seed, report)
+    for given in runs:
+        folder = run_folder(given)
+        result = _evaluate_run(folder, prepared, data, metrics, methods, trials, impl, seed, report)
+        result["run"] = str(given)
         evaluated.append(result)
-        if out is None:
-            _write(Path(folder), {"runs": [result]})
+        if out is None and folder == given:
+            _write(folder, {"runs": [result]})
     everything = {"runs": evaluated, "seconds": round(time.monotonic() - begun, 1)}
     if out is not None:
         out.mkdir(parents=True, exist_ok=True)
@@ -80,7 +83,7 @@ def _evaluate_run(folder, prepared, data, metrics, methods, trials, impl, seed, 
     settings = from_json(Settings, config["settings"], f"{folder}/config.json: settings")
     converted = Data(prepared(data or (config["data"] and Path(config["data"]))))
     key = jax.random.key(seed)
-    result: dict[str, Any] = {"run": str(folder), "task": task.name, "seed": seed}
+    result: dict[str, Any] = {"run": "", "task": task.name, "seed": seed}
     result |= {"downstream": [], "priors": [], "policy": []}
     for number, split in enumerate((*SPLITS[1:], SPLITS[0])):
         on_training_objects = split == SPLITS[0]
