@@ -1,5 +1,7 @@
 """Point operations against plain NumPy and SciPy; the network's invariances."""
 
+from dataclasses import replace
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -7,6 +9,7 @@ import pytest
 from scipy.spatial import cKDTree
 
 from vatmart_jax.perception.pointnet2 import (
+    Around,
     Level,
     PointNet2,
     PointNetConfig,
@@ -17,7 +20,10 @@ from vatmart_jax.perception.pointnet2 import (
 )
 
 TINY = PointNetConfig(
-    n_points=200, levels=(Level(40, 0.3, 8, (16, 16)), Level(8, 0.8, 8, (16, 32))), propagation=((16,), (32,))
+    n_points=200,
+    levels=(Level(40, 0.3, 8, (16, 16)), Level(8, 0.8, 8, (16, 32))),
+    propagation=((16,), (32,)),
+    around=(Around(0.2, 8, (16,)),),
 )
 
 
@@ -101,6 +107,18 @@ def test_queries_do_not_change_each_other() -> None:
     every = apply(params, points, grouped(points, queries))
     few = apply(params, points, grouped(points, queries[:5]))
     np.testing.assert_allclose(few, every[:5], rtol=1e-5, atol=1e-6)
+
+
+def test_what_lies_around_a_query_changes_its_feature_and_what_lies_far_off_does_not() -> None:
+    points, queries = jnp.asarray(cloud(1, 200)), jnp.asarray(cloud(2, 30))
+    near = jnp.argmin(((points - queries[0]) ** 2).sum(-1))
+    grouping = grouped(points, queries)
+    params = initial(jax.random.key(0), points, grouping)
+    alone = replace(grouping, around=tuple(jnp.full_like(a, near) for a in grouping.around))
+    lonely = apply(params, points, replace(alone, queries=queries + 10.0))
+    far = apply(params, points, replace(grouping, queries=queries + 10.0))
+    assert float(jnp.abs(apply(params, points, alone)[0] - apply(params, points, grouping)[0]).max()) > 1e-4
+    np.testing.assert_array_equal(lonely, far)
 
 
 def test_every_parameter_has_a_gradient() -> None:

@@ -85,6 +85,7 @@ class Networks:
             tuple(index(m, level.neighbours) for m, level in zip(sizes[1:], pointnet.levels, strict=True)),
             tuple(index(t, 3) for t in (1, *sizes[1:-1])),
             tuple(jnp.zeros((t, 3), jnp.float16) for t in (1, *sizes[1:-1])),
+            tuple(index(1, around.neighbours) for around in pointnet.around),
         )
         f, contact, task = jnp.zeros(pointnet.feature_dim), jnp.zeros(3), jnp.zeros(())
         trajectory, z = jnp.zeros(TRAJECTORY), jnp.zeros(self.config.latent_dim)

@@ -2,7 +2,8 @@
 
 Which points are sampled, grouped and interpolated depends on a cloud alone, not on the weights: `group` finds it once
 per view, and every pass of the network reuses it. Points that the network is asked about (`queries`: contact
-candidates, or the cloud itself for a heat map) are neither sampled nor grouped; their features are interpolated.
+candidates, or the cloud itself for a heat map) are not sampled; their features are interpolated and, where the config
+says so, joined by what lies around each of them, which shows a handle that coarse levels miss.
 
 Source: Qi et al. 2017; sizes as in VAT-Mart's and Where2Act's released networks.
 """
@@ -29,6 +30,15 @@ class Level:
 
 
 @dataclass(frozen=True)
+class Around:
+    """A group of the cloud's points about every query."""
+
+    radius: float  # unit lengths
+    neighbours: int
+    widths: tuple[int, ...]
+
+
+@dataclass(frozen=True)
 class PointNetConfig:
     """Sizes of one PointNet++; the defaults are the paper's."""
 
@@ -43,6 +53,8 @@ class PointNetConfig:
     """Set abstraction, finest first."""
     propagation: tuple[tuple[int, ...], ...] = ((128, 128, 128), (256, 128), (256, 256), (256, 256))
     """Widths of the feature propagation into each level, finest (the queries) first."""
+    around: tuple[Around, ...] = ()
+    """Groups about the queries themselves; the paper has none."""
     feature_dim: int = 128
     """Width of a query's feature."""
 
@@ -52,13 +64,14 @@ class PointNetConfig:
 
 
 SMALL = PointNetConfig(
-    n_points=1024,
+    n_points=4096,
     levels=(
         Level(256, 0.15, 16, (32, 32, 64)),
         Level(64, 0.3, 16, (64, 64, 128)),
         Level(16, 0.7, 16, (128, 128, 256)),
     ),
     propagation=((128, 128), (128, 128), (256, 128)),
+    around=(Around(0.06, 16, (32, 32, 64)), Around(0.15, 32, (32, 32, 64))),
 )
 """A ninth of the paper's arithmetic per view, for two CPU cores."""
 
@@ -75,6 +88,7 @@ class Grouping:
     neighbours: tuple[jax.Array, ...]  # L of [M_l, k_l], into level l - 1
     nearest: tuple[jax.Array, ...]  # L of [T, 3], into level l; T = C for l = 1, else M_{l-1}
     weights: tuple[jax.Array, ...]  # L of [T, 3] float16, inverse distances that sum to 1
+    around: tuple[jax.Array, ...]  # one of [C, k] for each of the config's, into the cloud
 
 
 def farthest_points(points: jax.Array, count: int) -> jax.Array:
@@ -165,7 +179,8 @@ def group(points: jax.Array, queries: jax.Array, config: PointNetConfig) -> Grou
         nearest.append(_compact(closest, level.centroids))
         weights.append(weight.astype(jnp.float16))
         below = targets = xyz
-    return Grouping(queries, tuple(centroids), tuple(neighbours), tuple(nearest), tuple(weights))
+    around = tuple(_compact(ball_query(points, queries, a.radius, a.neighbours), len(points)) for a in config.around)
+    return Grouping(queries, tuple(centroids), tuple(neighbours), tuple(nearest), tuple(weights), around)
 
 
 class Shared(nn.Module):
@@ -209,7 +224,14 @@ class PointNet2(nn.Module):
                 nearest, weights = _take(nearest, which), _take(weights, which)
             spread = jnp.sum(_take(features, nearest) * weights[..., None].astype(jnp.float32), -2)
             features = Shared(self.config.propagation[depth])(jnp.concatenate([spread, skips[depth]], -1))
-        return Shared((self.config.feature_dim,))(features)
+        parts = [features]
+        for kind, members in zip(self.config.around, grouping.around, strict=True):
+            members = members if which is None else _take(members, which)
+            offset = (_take(points.astype(jnp.float32), members) - skips[0][:, None]) / kind.radius
+            # A query with no point near has one from elsewhere, at a distance that means nothing.
+            inside = jnp.sum(offset**2, -1, keepdims=True) <= 1.01
+            parts.append(jnp.where(inside, Shared(kind.widths)(offset), 0.0).max(-2))
+        return Shared((self.config.feature_dim,))(jnp.concatenate(parts, -1))
 
 
 def _take(x: jax.Array, index: jax.Array) -> jax.Array:
