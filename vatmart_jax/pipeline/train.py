@@ -41,6 +41,10 @@ class Progress:
     done: jax.Array  # [] int32, units of that stage
     seconds: jax.Array  # [len(STAGES)] spent per stage, restarts included
 
+    def with_samples(self, new: Samples) -> Progress:
+        """Trials stored, in place of the oldest where the buffer is full."""
+        return self.replace(samples=self.samples.stored(new, self.stored), stored=self.stored + len(new.view))
+
 
 class Training:
     """One run on one environment. `train()` does what is left of it."""
@@ -61,9 +65,9 @@ class Training:
         """A key for one use, the same whenever the run is resumed."""
         return jax.random.fold_in(jax.random.fold_in(self._seed, hash_of(purpose)), index)
 
-    def train(self) -> Progress:
-        """All stages that are left; returns the final state."""
-        progress = self._run.restore(
+    def restore(self) -> Progress:
+        """Where the run stands: its last checkpoint, or the beginning."""
+        return self._run.restore(
             Progress(
                 explore=self._explorer.init(self.key("policy")),
                 perception=perception.begin(self.key("networks"), self.config),
@@ -74,6 +78,10 @@ class Training:
                 seconds=jnp.zeros(len(STAGES)),
             )
         )
+
+    def train(self) -> Progress:
+        """All stages that are left; returns the final state."""
+        progress = self.restore()
         for stage in range(int(progress.stage), len(STAGES)):
             self._begun = time.monotonic()
             progress = getattr(self, f"_{STAGES[stage]}")(progress)
@@ -121,7 +129,7 @@ class Training:
             state, final, metrics = self._explorer.iterate(progress.explore, self.pool(), None)
             progress = progress.replace(explore=state)
             if done >= late:
-                progress = _store(progress, samples_of(final))
+                progress = progress.with_samples(samples_of(final))
             progress = self._tick(progress, "explore", done + 1, total, metrics)
         return progress
 
@@ -139,7 +147,7 @@ class Training:
                 "in_collision": final.in_collision.mean(),
                 "diverged": final.physics.diverged.sum(),
             }
-            progress = self._tick(_store(progress, samples), "collect", done + 1, schedule.collect, metrics)
+            progress = self._tick(progress.with_samples(samples), "collect", done + 1, schedule.collect, metrics)
         return progress
 
     def _scorer(self, progress: Progress) -> Progress:
@@ -189,7 +197,8 @@ class Training:
                 state, final, metrics = self._explorer.iterate(progress.explore, self.pool(), penalty)
                 found = samples_of(final)
                 score = self._score(params, self.clouds(), found.view, found.contact, found.task, found.trajectory)
-                progress = _store(progress.replace(explore=state), curious(found, score, self._env.config.tolerance))
+                surprising = curious(found, score, self._env.config.tolerance)
+                progress = progress.replace(explore=state).with_samples(surprising)
                 success = found.success(self._env.config.tolerance)
                 metrics["novel"] = (success & (score < 0.5)).sum() / jnp.maximum(success.sum(), 1)
             progress, losses = self._round(progress, schedule.curiosity_steps)
@@ -207,7 +216,7 @@ class Training:
                 key = self.key("finetune", done * schedule.finetune_batches + batch)
                 _, found, chosen = trials.explore(progress.perception.params, key)
                 rates.append(float(found.success(self._env.config.tolerance)[chosen].mean()))
-                progress = _store(progress, found)
+                progress = progress.with_samples(found)
             progress, losses = self._round(progress, schedule.finetune_steps)
             metrics = {"success": float(np.mean(rates))} | losses
             progress = self._tick(progress, "finetune", done + 1, schedule.finetune, metrics)
@@ -228,11 +237,6 @@ def hash_of(text: str) -> int:
     for character in text.encode():
         value = (value * 131 + character) % (2**31 - 1)
     return value
-
-
-def _store(progress: Progress, new: Samples) -> Progress:
-    n = len(new.view)
-    return progress.replace(samples=progress.samples.stored(new, progress.stored), stored=progress.stored + n)
 
 
 def _curiosity_penalty(networks: Networks, params: Any, clouds: Clouds, weight: jax.Array, final) -> jax.Array:
