@@ -98,11 +98,11 @@ class PerceptionConfig:
     """share whose task is shifted off that; the rest keep the commanded task, failed starts and grasps among them"""
     shift: float = 0.45
     """largest shift; the paper has 0.45 for drawers and 45 degrees for doors"""
-    yaw: float = 0.0
+    yaw: float = 0.25
     """augmentation: views turn about the vertical by up to this much (rad), either way"""
     mirror: bool = True
     """augmentation: half of the views are mirrored left to right"""
-    scale: float = 0.0
+    scale: float = 0.2
     """augmentation: views, and what happens in them, grow or shrink by up to this share"""
     task_is_length: bool = False
     """tasks grow with the view (drawers)"""
@@ -120,7 +120,7 @@ class PerceptionConfig:
     """of the squared 6D distance of start rotations"""
     kl_weight: float = 1.0
     """of the KL divergence; at 0.05 the decoder's samples ignore contact and task"""
-    kl_free: float = 0.0
+    kl_free: float = 3.0
     """nats of it that cost nothing, so that the posterior does not collapse before the decoder has learned to listen"""
     actionability_weight: float = 5.0
     """of the L1 of actionability"""
