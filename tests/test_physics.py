@@ -1,3 +1,6 @@
+import os
+import subprocess
+import sys
 from dataclasses import replace
 
 import jax
@@ -286,3 +289,17 @@ def test_halving_the_time_step_hardly_moves_the_part(cabinets):
         state = physics.reset(*pushes.starts())
         moved.append(physics.rollout(state, pushes.controls().repeat(share, 1), EVERYONE).qpos[:, PART])
     assert np.median(np.abs(moved[0] - moved[1])) < 5e-3
+
+
+@pytest.mark.skipif(not hasattr(os, "sched_setaffinity"), reason="CPUs are not assigned here")
+def test_a_single_cpu_does_not_wait_for_itself() -> None:
+    program = """
+import os; os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})
+import vatmart_jax.physics.c
+import jax, jax.numpy as jnp, numpy as np
+x = jnp.full((512, 512), 1e-3)
+twice = lambda x: jax.pure_callback(lambda x: 2 * np.asarray(x), jax.ShapeDtypeStruct(x.shape, x.dtype), x @ x).sum()
+for _ in range(5): float(jax.jit(twice)(x))
+"""
+    environment = {name: value for name, value in os.environ.items() if name != "NPROC"}
+    subprocess.run([sys.executable, "-c", program], env=environment, check=True, timeout=120)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import threading
 from contextlib import contextmanager
 
@@ -14,6 +15,11 @@ from mujoco.batch import Batch
 from vatmart_jax.bank import SceneBank
 from vatmart_jax.physics.interface import PhysicsState
 from vatmart_jax.physics.template import N_CTRL, N_QPOS, SCENE_FIELDS, PhysicsConfig, template
+
+# XLA copies a callback's arguments on the pool of threads of which the callback occupies one: on a single CPU it would
+# wait for itself for ever. Read when JAX's backend starts.
+if (len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()) == 1:
+    os.environ.setdefault("NPROC", "2")
 
 # float64 numbers a simulation carries between calls: position, velocity and the solver's warm start.
 _EXACT = ("qpos", "qvel", "qacc_warmstart")
