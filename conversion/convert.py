@@ -23,6 +23,7 @@ from multiprocessing.connection import Connection, wait
 from pathlib import Path
 from typing import Any, Literal
 
+import numpy as np
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
@@ -54,6 +55,8 @@ class ViewConfig:
 
     views: int = 6
     """Views of every Scene for a push task, and as many for a pull task."""
+    train_factor: int = 3
+    """Training Scenes get so many times as many: the networks learn a few views by heart."""
     points: int = 4096
     """Points per view; the paper has 10,000."""
     contacts: int = 128
@@ -280,7 +283,8 @@ def _banks(
     write_json(out / "splits.json", table)
     joined([SceneBank.load(out / name / "scenes.npz") for name in names]).save(out / "scenes.npz")
     links = scene_bank(objects, config.variants, config.collision, config.seed)
-    found, without = views(objects, links, config.views, config.points, config.contacts, config.seed, jobs)
+    per_scene = config.views * np.where(links.split == "train", config.train_factor, 1)
+    found, without = views(objects, links, per_scene, config.points, config.contacts, config.seed, jobs)
     found.save(out / "views.npz")
     without_views = [why for _, why in without]
     reports = [_read_json(out / name / "report.json") for name in names]

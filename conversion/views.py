@@ -127,15 +127,15 @@ def _triangles(converted: ConvertedObject, groups: list[Placement]) -> tuple[np.
 
 
 def views(
-    objects: Sequence[ConvertedObject], bank: SceneBank, per_scene: int, n_points: int, n_contacts: int, seed: int,
-    jobs: int,
+    objects: Sequence[ConvertedObject], bank: SceneBank, per_scene: int | np.ndarray, n_points: int, n_contacts: int,
+    seed: int, jobs: int,
 ) -> tuple[ViewBank, list[tuple[int, str]]]:  # fmt: skip
     """Views of every Scene: `per_scene` for push tasks and as many for pull tasks; and (scene, why) of those without.
 
-    objects: at least those of the bank. seed: the one the bank was made with. jobs: processes. A push view leaves the
-    part room to close by a task's length, a pull view to open. A Scene whose part the camera does not get to see has no
-    views. View k of a Scene depends on the seed, its object, part and variant, and k alone. Raises ObjectError where
-    bank and objects do not belong together.
+    per_scene: one for all, or [S], the same for the Scenes of an object. objects: at least those of the bank. seed: the
+    one the bank was made with. jobs: processes. A push view leaves the part room to close by a task's length, a pull
+    view to open. A Scene whose part the camera does not get to see has no views. View k of a Scene depends on the seed,
+    its object, part and variant, and k alone. Raises ObjectError where bank and objects do not belong together.
     """
     by_id = {o.obj.id: o for o in objects}
     work = []
@@ -143,7 +143,8 @@ def views(
         if object_id not in by_id:
             raise ObjectError(f"{object_id}: a Scene of the bank has no object; convert it again")
         scenes = np.flatnonzero(bank.object_id == object_id)
-        work.append((by_id[object_id], bank.select(scenes), scenes, per_scene, n_points, n_contacts, seed))
+        count = int(np.broadcast_to(per_scene, len(bank))[scenes[0]])
+        work.append((by_id[object_id], bank.select(scenes), scenes, count, n_points, n_contacts, seed))
     done: dict[int, ViewBank | str] = {}
     with Progress(console=Console(stderr=True), transient=True) as progress:
         bar = progress.add_task("Rendering", total=len(bank))

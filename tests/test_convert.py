@@ -6,6 +6,7 @@ import json
 import os
 import shutil
 import time
+from collections import Counter
 from dataclasses import fields, replace
 from pathlib import Path
 
@@ -63,7 +64,9 @@ def test_banks_hold_every_part_of_every_object(result):
     scenes, views = SceneBank.load(out / "scenes.npz"), ViewBank.load(out / "views.npz")
     expected = {(n, p.link) for n in objects_in(out) for p in ConvertedObject.load(out / n).parts}
     assert {*zip(scenes.object_id.tolist(), scenes.part.tolist(), strict=True)} == expected
-    assert len(views) == 2 * len(scenes)
+    expected = [(scene, task) for scene in range(len(scenes)) for task in (True, False)]
+    times = {key: 3 if scenes.split[key[0]] == "train" else 1 for key in expected}
+    assert Counter(zip(views.scene.tolist(), views.opening.tolist(), strict=True)) == times
     assert np.diff(scenes.static_start).max() <= QUICK.static_budget
     assert np.diff(scenes.part_start).max() <= QUICK.part_budget
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 from vatmart_jax.env import EnvConfig
 from vatmart_jax.perception.networks import NetworksConfig
@@ -95,8 +95,8 @@ PRESETS = {
             noise=(0.1, 0.1 / 2**10),
         ),
         perception=PerceptionConfig(
-            networks=replace(NetworksConfig(), separate=True), views=8, queries=4, probes=4, mirror=False, yaw=0.0,
-            scale=0.0, kl_free=0.0,
+            networks=NetworksConfig(separate=True, positions=False), views=8, queries=4, probes=4,
+            mirror=False, yaw=0.0, scale=0.0, kl_free=0.0,
         ),
         schedule=Schedule(
             samples=20_000, collect=160, scorer=16_000, proposal=35_000, actionability=5000, curiosity=1500,

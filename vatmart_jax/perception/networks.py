@@ -39,6 +39,8 @@ class NetworksConfig:
     """Width of the contact point's feature."""
     task_dim: int = 32
     """Width of the task's feature."""
+    positions: bool = True
+    """The trajectory encoder also reads where the fingertips are sent: residuals summed up. The paper's does not."""
     trajectory: tuple[int, ...] = (128, 128, 128)
     """Widths of the trajectory encoder."""
     latent_dim: int = 128
@@ -184,9 +186,10 @@ class TrajectoryHead(nn.Module):
 
     @nn.compact
     def __call__(self, f: jax.Array, contact: jax.Array, task: jax.Array, trajectory: jax.Array) -> jax.Array:
-        positions = waypoint_positions(contact, trajectory)
-        trajectory = jnp.broadcast_to(trajectory, (*positions.shape[:-1], TRAJECTORY))
-        x = jnp.concatenate([trajectory * jnp.array(SCALE), positions], -1)
+        x = trajectory * jnp.array(SCALE)
+        if self.config.positions:
+            positions = waypoint_positions(contact, trajectory)
+            x = jnp.concatenate([jnp.broadcast_to(x, (*positions.shape[:-1], TRAJECTORY)), positions], -1)
         for width in self.config.trajectory[:-1]:
             x = nn.leaky_relu(nn.Dense(width)(x))
         x = nn.Dense(self.config.trajectory[-1])(x)

@@ -1,0 +1,37 @@
+"""Put what a finished run learned where `vatmart evaluate push-door` and its like find it.
+
+python experiments/pretrain.py --run RUN --name push-door
+"""
+
+import shutil
+from dataclasses import dataclass
+from pathlib import Path
+
+import tyro
+
+from vatmart_jax import pretrained
+from vatmart_jax.files import whole_folder, write_json
+from vatmart_jax.inference import Priors
+from vatmart_jax.pipeline.run import read_config
+
+
+@dataclass(frozen=True)
+class Pretrain:
+    """Copy a run's priors, policy and config into the package."""
+
+    run: Path
+    """run folder of `vatmart train`"""
+    name: str
+
+
+def main(args: Pretrain) -> None:
+    config = {**read_config(args.run), "data": None}  # where the objects lay is nobody's business
+    priors = Priors.load(args.run)
+    with whole_folder(pretrained.FOLDER / args.name) as folder:
+        write_json(folder / "config.json", config)
+        priors.save(folder / "priors")
+        shutil.copyfile(args.run / "policy.msgpack", folder / "policy.msgpack")
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Pretrain))
