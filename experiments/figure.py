@@ -1,6 +1,6 @@
 """What priors see, propose and do, one row per task: heat map, three best trajectories, the best one executed.
 
-MUJOCO_GL=osmesa python experiments/figure.py --data DATA --rows push-door:45135 push-drawer:45194 --out figure.png
+MUJOCO_GL=osmesa python experiments/figure.py --data DATA --rows push-door:45135@0.6 --out figure.png
 """
 
 import tempfile
@@ -34,7 +34,8 @@ class Figure:
     data: Path
     """what `vatmart convert` made"""
     rows: tuple[str, ...]
-    """priors:scene, as in push-door:45135: a run folder or the name of pretrained ones, and an object or object:part"""
+    """priors:scene@amount, as in push-door:45135@0.6: a run folder or the name of pretrained ones; object or
+    object:part; rad or unit lengths"""
     out: Path
     seed: int = 0
 
@@ -48,29 +49,30 @@ def main(args: Figure) -> None:
     for axis in axes.flat:
         axis.axis("off")
     for row, text in zip(axes, args.rows, strict=True):
-        run, _, scene = text.partition(":")
+        run, _, rest = text.partition(":")
+        scene, _, amount = rest.partition("@")
         priors = Priors.load(run_folder(Path(run)))
-        recording, result = play(args.data, scene, run=run_folder(Path(run)), seed=args.seed)
+        recording, result = play(args.data, scene, amount=float(amount), run=run_folder(Path(run)), seed=args.seed)
         chosen = np.array([find_scene(bank, scene)])
         env = Env(bank.select(chosen), views.of_scenes(chosen), TASKS[priors.config.task])
         view, task = int(recording.state.start.view[0]), float(recording.state.start.task[0])
         points, mask = env.views.points[view].astype(np.float32), env.views.part_mask[view]
         found = priors.predict(points, task, mask, jax.random.key(args.seed))
-        amount = f"{np.degrees(task):.0f} degrees" if priors.config.task.endswith("door") else f"{task:.2f}"
+        asked = f"{np.degrees(task):.0f} degrees" if priors.config.task.endswith("door") else f"{task:.2f}"
         moved = result["moved"] if priors.config.task.endswith("drawer") else np.degrees(result["moved"])
         with tempfile.TemporaryDirectory() as folder:
             heat, film = Path(folder) / "heat.png", Path(folder) / "trial.gif"
             pictures.priors(
                 points, mask, np.asarray(found.actionability), found.contact, np.asarray(found.trajectories[:3]),
                 np.asarray(found.scores[:3]), (float(env.views.azimuth[view]), float(env.views.elevation[view])),
-                f"{priors.config.task} by {amount}", heat, env.config.standoff,
+                f"{priors.config.task} by {asked}", heat, env.config.standoff,
             )  # fmt: skip
             animate(recording, film)
             row[0].imshow(plt.imread(heat))
             with Image.open(film) as frames:
                 for axis, moment in zip(row[1:], MOMENTS, strict=True):
                     frames.seek(round(moment * (frames.n_frames - 1)))
-                    axis.imshow(np.asarray(frames.convert("RGB")))
+                    axis.imshow(np.asarray(frames.convert("RGB"))[40:-20, 70:-70])
         row[-1].set_title(f"moved {moved:.3g}", fontsize=8)
         print(text, result)
     figure.tight_layout(pad=0.2)
