@@ -18,7 +18,7 @@ from vatmart_jax.perception.train import PerceptionConfig
 from vatmart_jax.physics import PhysicsConfig
 from vatmart_jax.pipeline.explore import ExploreConfig
 from vatmart_jax.pipeline.run import Run, RunError
-from vatmart_jax.presets import PRESETS, EvaluationConfig, Schedule, Settings
+from vatmart_jax.presets import PRESETS, EvaluationConfig, Schedule, Settings, default_preset
 from vatmart_jax.rl.td3 import TD3Config
 from vatmart_jax.training import resolve, train
 
@@ -176,6 +176,12 @@ def test_a_task_without_objects_is_refused(cabinets, tmp_path):
     with pytest.raises(UserError, match=r"split train: the data has no drawer \(slide\)"):
         run(tmp_path, tmp_path / "run")
     assert not (tmp_path / "run").exists()
+
+
+def test_the_bundled_objects_are_quick_and_own_ones_get_what_the_machine_can_do(monkeypatch):
+    assert default_preset(own_data=False) == "quick" and default_preset(own_data=True) == "cpu"
+    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
+    assert default_preset(own_data=False) == "quick" and default_preset(own_data=True) == "gpu"
 
 
 @pytest.mark.parametrize("name", PRESETS)

@@ -106,9 +106,9 @@ def _generate(argv: list[str]) -> None:
 
 def _train(argv: list[str]) -> None:
     """Train priors for one task: all stages, resumable."""
-    from vatmart_jax.presets import PRESETS, Settings
+    from vatmart_jax.presets import PRESETS, Settings, default_preset
 
-    chosen = _peek(argv, "--preset") or "quick"
+    chosen = _peek(argv, "--preset") or default_preset(_peek(argv, "--data") is not None)
     one_of("--preset", chosen, PRESETS)
 
     @dataclass(frozen=True)
@@ -125,7 +125,8 @@ def _train(argv: list[str]) -> None:
         data: Path | None = None
         """a folder of objects, or what `vatmart convert` made of it; default the bundled objects"""
         preset: str = chosen
-        """quick, cpu, gpu or paper; the flags below start from it"""
+        """quick, cpu, gpu or paper; the flags below start from it; default quick for the bundled objects, and with
+        --data gpu on a GPU, else cpu"""
         impl: str | None = None
         """physics: c, warp or jax; default warp on an NVIDIA GPU, else c"""
         seed: int = 0

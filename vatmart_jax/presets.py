@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
+import jax
+
 from vatmart_jax.env import EnvConfig
 from vatmart_jax.perception.networks import NetworksConfig
 from vatmart_jax.perception.pointnet2 import SMALL
@@ -104,3 +106,10 @@ PRESETS = {
         ),
     ),
 }  # fmt: skip
+
+
+def default_preset(own_data: bool) -> str:
+    """`quick` for the bundled objects; for one's own the best that this machine does: `gpu` on a GPU, else `cpu`."""
+    if not own_data:
+        return "quick"
+    return "gpu" if jax.default_backend() == "gpu" else "cpu"
