@@ -53,10 +53,10 @@ class PointNetConfig:
     """Set abstraction, finest first."""
     propagation: tuple[tuple[int, ...], ...] = ((128, 128, 128), (256, 128), (256, 256), (256, 256))
     """Widths of the feature propagation into each level, finest (the queries) first."""
-    around: tuple[Around, ...] = ()
-    """Groups about the queries themselves; the paper has none."""
     feature_dim: int = 128
     """Width of a query's feature."""
+    around: tuple[Around, ...] = ()
+    """Groups about the queries themselves; the paper has none."""
 
     def __post_init__(self) -> None:
         if len(self.levels) != len(self.propagation):
