@@ -63,12 +63,10 @@ def evaluate(
     begun = time.monotonic()
     evaluated = []
     for given in runs:
-        folder = run_folder(given)
-        result = _evaluate_run(folder, prepared, data, metrics, methods, trials, impl, seed, report)
-        result["run"] = str(given)
+        result = _evaluate_run(given, prepared, data, metrics, methods, trials, impl, seed, report)
         evaluated.append(result)
-        if out is None and folder == given:
-            _write(folder, {"runs": [result]})
+        if out is None and given.is_dir():
+            _write(given, {"runs": [result]})
     everything = {"runs": evaluated, "seconds": round(time.monotonic() - begun, 1)}
     if out is not None:
         out.mkdir(parents=True, exist_ok=True)
@@ -76,34 +74,38 @@ def evaluate(
     return everything, _tables(evaluated)
 
 
-def _evaluate_run(folder, prepared, data, metrics, methods, trials, impl, seed, report) -> dict[str, Any]:
+def _evaluate_run(given, prepared, data, metrics, methods, trials, impl, seed, report) -> dict[str, Any]:
+    folder = run_folder(given)
     config = read_config(folder)
     task = TASKS[config["task"]]
     priors = Priors.load(folder / "priors")
     settings = from_json(Settings, config["settings"], f"{folder}/config.json: settings")
     converted = Data(prepared(data or (config["data"] and Path(config["data"]))))
     key = jax.random.key(seed)
-    result: dict[str, Any] = {"run": "", "task": task.name, "seed": seed}
+    result: dict[str, Any] = {"run": str(given), "task": task.name, "seed": seed}
     result |= {"downstream": [], "priors": [], "policy": []}
-    for number, split in enumerate((*SPLITS[1:], SPLITS[0])):
-        on_training_objects = split == SPLITS[0]
-        if not set(metrics) & ({"policy"} if on_training_objects else {"downstream", "priors"}):
-            continue
+
+    def environment(split: str) -> Env | None:
         try:
-            env = converted.env(split, task, impl, settings.env, settings.physics)
+            return converted.env(split, task, impl, settings.env, settings.physics)
         except DataError as e:
             report(f"{split} left out: {e}", 1, 1, {})
-            continue
-        kd, kp = jax.random.split(jax.random.fold_in(key, number))
-        if on_training_objects:
-            result["policy"].append(_evaluate_policy(folder, env, settings, trials, kp, report))
-            continue
-        if "downstream" in metrics:
-            proposals = settings.evaluation.proposals
-            result["downstream"] += evaluate_split(split, env, priors, methods, trials, proposals, kd, report)
-        if "priors" in metrics:
-            scores = _priors_split(folder, env, priors, settings, kp, split, report)
-            result["priors"].append({"split": split, **scores})
+            return None
+
+    if {"downstream", "priors"} & set(metrics):
+        for number, split in enumerate(SPLITS[1:]):
+            if (env := environment(split)) is None:
+                continue
+            kd, kp = jax.random.split(jax.random.fold_in(key, number))
+            if "downstream" in metrics:
+                proposals = settings.evaluation.proposals
+                result["downstream"] += evaluate_split(split, env, priors, methods, trials, proposals, kd, report)
+            if "priors" in metrics:
+                scores = _priors_split(folder, env, priors, settings, kp, split, report)
+                result["priors"].append({"split": split, **scores})
+    if "policy" in metrics and (env := environment(SPLITS[0])) is not None:
+        _, kp = jax.random.split(jax.random.fold_in(key, len(SPLITS) - 1))
+        result["policy"].append(_evaluate_policy(folder, env, settings, trials, kp, report))
     if not any(result[name] for name in METRICS):
         raise UserError(f"{converted.folder}: has no object to evaluate task {task.name} on; see splits.json")
     return result
@@ -147,7 +149,7 @@ def _ours(trial: ProposalTrials, priors: Priors) -> Method:
 
 def _priors_split(
     folder: Path, env: Env, priors: Priors, settings: Settings, key: jax.Array, split: str, report: Report
-) -> dict[str, float]:
+) -> dict[str, Any]:
     explorer = Explorer(env, settings.explore)
     policy = _policy(folder, explorer)
     kl, km = jax.random.split(key)
@@ -232,7 +234,7 @@ def _tables(runs: Sequence[dict[str, Any]]) -> str:
 
 def _write(folder: Path, everything: dict[str, Any]) -> None:
     curves = {
-        f"{run['task']}, {row['split']}": row["reliability"]
+        f"{Path(run['run']).name}, {row['split']}": row["reliability"]
         for run in everything["runs"]
         for row in run["downstream"]
         if "reliability" in row
