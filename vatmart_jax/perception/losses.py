@@ -6,6 +6,8 @@ import jax
 import jax.numpy as jnp
 import optax
 
+from vatmart_jax.geometry import since_start
+
 
 def score_loss(logits: jax.Array, labels: jax.Array) -> jax.Array:
     """Binary cross-entropy of logits and labels (0 or 1), both [...], the two classes weighing the same."""
@@ -25,7 +27,7 @@ def reconstruction_losses(
     gradient at 0; the squared distance of 6D numbers (Zhou et al. 2019) has, and keeps the raw output near unit length.
     """
     difference = predicted - truth
-    steps = jnp.abs(jnp.cumsum(difference[..., 6:].reshape(*difference.shape[:-1], -1, 6), -2))
+    steps = jnp.abs(since_start(difference))
     mean = lambda x: jnp.sum(x * weights) / jnp.maximum(weights.sum(), 1)  # noqa: E731
     moves, turns = steps[..., :3].mean((-2, -1)), steps[..., 3:].mean((-2, -1))
     return mean(moves), mean(turns), mean(jnp.sum(difference[..., :6] ** 2, -1))

@@ -15,7 +15,7 @@ import flax.linen as nn
 import jax
 import jax.numpy as jnp
 
-from vatmart_jax.geometry import TRAJECTORY, WAYPOINTS, matrix_from_rot6d, rot6d_from_matrix
+from vatmart_jax.geometry import TRAJECTORY, WAYPOINTS, matrix_from_rot6d, rot6d_from_matrix, since_start
 from vatmart_jax.perception.pointnet2 import Grouping, PointNet2, PointNetConfig
 
 Params = dict  # of the networks' names to their Flax parameters
@@ -201,8 +201,7 @@ def waypoint_positions(contact: jax.Array, trajectory: jax.Array) -> jax.Array:
 
     What the sum is decides whether the part arrives; the trajectory encoder need not learn to add.
     """
-    moves = jnp.cumsum(trajectory[..., 6:].reshape(*trajectory.shape[:-1], WAYPOINTS, 6), -2)[..., :3]
-    positions = contact[..., None, :] + moves
+    positions = contact[..., None, :] + since_start(trajectory)[..., :3]
     return positions.reshape(*positions.shape[:-2], 3 * WAYPOINTS)
 
 

@@ -126,8 +126,8 @@ def priors(
 
 def waypoints(trajectory: np.ndarray, contact: np.ndarray, standoff: float) -> tuple[np.ndarray, np.ndarray]:
     """Commanded fingertip positions [5, 3] and hand frames [5, 3, 3], object frame, of one trajectory [30]."""
-    start, residuals = g.unpack_trajectory(jnp.asarray(trajectory))
-    total = jnp.concatenate([jnp.zeros((1, 6)), jnp.cumsum(residuals, 0)])
+    start, _ = g.unpack_trajectory(jnp.asarray(trajectory))
+    total = jnp.concatenate([jnp.zeros((1, 6)), g.since_start(jnp.asarray(trajectory))])
     frames = start @ g.matrix_from_euler(total[:, 3:])
     tips = contact - standoff * np.asarray(start[:, 2]) + np.asarray(total[:, :3])
     return tips, np.asarray(frames)

@@ -65,23 +65,24 @@ class Training:
         """A key for one use, the same whenever the run is resumed."""
         return jax.random.fold_in(jax.random.fold_in(self._seed, hash_of(purpose)), index)
 
-    def restore(self) -> Progress:
-        """Where the run stands: its last checkpoint, or the beginning."""
-        return self._run.restore(
-            Progress(
-                explore=self._explorer.init(self.key("policy")),
-                perception=perception.begin(self.key("networks"), self.config),
-                samples=Samples.empty(self._settings.schedule.samples),
-                stored=jnp.int32(0),
-                stage=jnp.int32(0),
-                done=jnp.int32(0),
-                seconds=jnp.zeros(len(STAGES)),
-            )
+    def beginning(self) -> Progress:
+        """Nothing done yet."""
+        return Progress(
+            explore=self._explorer.init(self.key("policy")),
+            perception=perception.begin(self.key("networks"), self.config),
+            samples=Samples.empty(self._settings.schedule.samples),
+            stored=jnp.int32(0),
+            stage=jnp.int32(0),
+            done=jnp.int32(0),
+            seconds=jnp.zeros(len(STAGES)),
         )
 
-    def train(self) -> Progress:
-        """All stages that are left; returns the final state."""
-        progress = self.restore()
+    def train(self, begun: Progress | None = None) -> Progress:
+        """All stages that are left; returns the final state.
+
+        begun: where a run starts that has no checkpoint yet, such as another run's trials; default the beginning.
+        """
+        progress = self._run.restore(begun or self.beginning())
         for stage in range(int(progress.stage), len(STAGES)):
             self._begun = time.monotonic()
             progress = getattr(self, f"_{STAGES[stage]}")(progress)
