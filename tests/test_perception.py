@@ -13,7 +13,7 @@ from synthetic import boxes, outcome, samples
 from vatmart_jax import geometry as g
 from vatmart_jax.perception import losses
 from vatmart_jax.perception import train as t
-from vatmart_jax.perception.networks import DenseOfParts, Features, Networks, NetworksConfig
+from vatmart_jax.perception.networks import DenseOfParts, Features, Networks, NetworksConfig, places_and_turn
 from vatmart_jax.perception.pointnet2 import Level, PointNetConfig
 from vatmart_jax.presets import PRESETS
 
@@ -25,6 +25,7 @@ CONFIG = t.PerceptionConfig(
     networks=NetworksConfig(pointnet=TINY), high=0.5, views=4, queries=32, probes=8, proposals=16, yaw=0.0, scale=0.0,
     steps_per_call=10,
 )  # fmt: skip
+COURSE = replace(CONFIG, networks=NetworksConfig(pointnet=TINY, course=(64,)))
 
 
 @pytest.fixture(scope="module")
@@ -74,8 +75,9 @@ def test_a_dense_layer_of_parts_is_one_of_their_concatenation() -> None:
     np.testing.assert_allclose(layer.apply(params, a, b), expected, rtol=1e-4, atol=1e-5)  # pyright: ignore
 
 
-def test_proposals_at_many_points_are_those_at_each(fresh) -> None:
-    networks = Networks(CONFIG.networks)
+@pytest.mark.parametrize("config", [CONFIG, COURSE], ids=["paper", "course"])
+def test_proposals_at_many_points_are_those_at_each(config) -> None:
+    networks, fresh = Networks(config.networks), t.begin(jax.random.key(0), config)
     f, contact = jax.random.normal(jax.random.key(0), (5, 128)), jax.random.normal(jax.random.key(1), (5, 3))
     task, z = jnp.linspace(0.1, 0.5, 5), jax.random.normal(jax.random.key(2), (7, 128))
     at = lambda f: Features(f, f, f)  # noqa: E731
@@ -167,6 +169,47 @@ def test_mirrored_turned_and_scaled_scenes_have_motions_to_match(world, data) ->
         # The hand is its own mirror image, left for right.
         left = jnp.diag(jnp.array([1.0, -1.0 if mirrored else 1.0, 1.0]))
         np.testing.assert_allclose(hand, whole @ hand0 @ left, atol=1e-5)
+
+
+def test_the_course_of_a_mirrored_turned_and_scaled_scene_is_that_of_the_scene(world, data) -> None:
+    clouds, _ = world
+    joints = tuple(jax.random.normal(jax.random.key(i), (len(clouds), 3)) for i in (3, 4))
+    clouds = clouds.replace(joints=(g.normalize(joints[0]), joints[1]))
+    batch = t._draw(jax.random.key(0), clouds, data, t._index(data, len(clouds)), replace(COURSE, mirror=False))
+    one = jax.tree.map(lambda a: a[0], batch)
+    contact, task = one.grouping.queries[one.which[: CONFIG.queries]], one.task
+    for mirrored, hinge in ((False, True), (True, True), (True, False)):
+        found = t.transformed(one, jnp.array(mirrored), jnp.float32(0.7), jnp.float32(1.2), task_is_length=not hinge)
+        whole = g.matrix_from_rotvec(jnp.array([0.0, 0.0, 0.7])) @ jnp.diag(jnp.array([1.0, 1 - 2.0 * mirrored, 1.0]))
+        course = lambda joints, contact, task: places_and_turn(  # noqa: E731
+            t.true_course(contact[None], *(x[None] for x in joints), task[None], hinge)[0]  # noqa: B023
+        )
+        places, turn = course(found.joints, 1.2 * contact @ whole.T, found.task)
+        places0, turn0 = course(one.joints, contact, task)
+        np.testing.assert_allclose(places, 1.2 * places0 @ whole.T, atol=1e-5)
+        np.testing.assert_allclose(turn, (1 - 2.0 * mirrored) * turn0 @ whole.T, atol=1e-5)
+        # The last place is where the turn carries the contact.
+        if hinge:
+            anchor, arm = one.joints[1], contact - one.joints[1]
+            np.testing.assert_allclose(
+                g.rotate(g.matrix_from_rotvec(turn0), arm) + anchor, contact + places0[:, -1], atol=1e-5
+            )
+
+
+def test_a_course_can_be_learned_and_is_asked_for_labels(world, data) -> None:
+    clouds, fresh = world[0], t.begin(jax.random.key(0), COURSE)
+    with pytest.raises(ValueError, match="the clouds come without joints"):
+        t.train(fresh, clouds, data, COURSE, "course", 1)
+    along = jnp.broadcast_to(jnp.array([1.0, 0.0, 0.0]), (len(clouds), 3))
+    errors: list[float] = []
+    config = replace(COURSE, task_is_length=True)
+    after = t.train(
+        fresh, clouds.replace(joints=(along, jnp.zeros_like(along))), data, config, "course", 60,
+        lambda _, metrics: errors.append(metrics["course_error"]),
+    )  # fmt: skip
+    assert errors[-1] < 0.5 * errors[0]
+    same = {name for name in fresh.params if trees_equal(fresh.params[name], after.params[name])}
+    assert same == set(fresh.params) - {"course", "encoder"}
 
 
 @pytest.mark.parametrize(

@@ -199,7 +199,8 @@ def bench_perception(choice: Choice, preset: str, seed: int, seconds: float) -> 
     _, views = choice.banks(seed)
     views = views.select(rng.permutation(len(views))[: 2 * config.views])
     views = replace(views, points=_with_points(rng, views.points, max(10_000, pointnet.n_points)))
-    clouds = perception.clouds_of(views, pointnet)
+    upright = jnp.broadcast_to(jnp.array([0.0, 0.0, 1.0]), (len(views), 3))
+    clouds = perception.clouds_of(views, pointnet).replace(joints=(upright, jnp.zeros((len(views), 3))))
     rows = 4 * config.views * config.queries
     samples = perception.Samples(
         view=jnp.asarray(rng.integers(0, len(views), rows), jnp.int32),
@@ -211,7 +212,8 @@ def bench_perception(choice: Choice, preset: str, seed: int, seconds: float) -> 
     )
     state = perception.begin(jax.random.key(seed), config)
     steps = partial(perception.train, state, clouds, samples, config, steps=config.steps_per_call)
-    stages = {stage: _timed(lambda _, stage=stage: steps(stage=stage), seconds) for stage in perception.STAGES}
+    trained = [stage for stage in perception.STAGES if stage != "course" or config.networks.course]
+    stages = {stage: _timed(lambda _, stage=stage: steps(stage=stage), seconds) for stage in trained}
 
     points, queries = (jnp.asarray(x[0], jnp.float32) for x in (views.points[:, :10_000], views.contacts))
     grouping = _timed(lambda _: _group(points, queries, pointnet), seconds)

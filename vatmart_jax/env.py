@@ -422,11 +422,12 @@ class Env:
     def carried(self, state: EnvState, point: jax.Array, amount: jax.Array) -> jax.Array:
         """[B, 3] where points [B, 3] of the part come to when it moves by `amount` [B] in the task's sense."""
         scene = state.physics.scene
-        axis, change = self._motion_axis(scene), amount[:, None]
-        if self.task.joint_type == HINGE:
-            anchor = self._scenes.anchor[scene]
-            return anchor + g.rotate(g.matrix_from_rotvec(axis * change), point - anchor)
-        return point + axis * change
+        axis, anchor = self._motion_axis(scene), self._scenes.anchor[scene]
+        return g.carried(point, axis, anchor, amount, self.task.joint_type == HINGE)
+
+    def joints(self) -> tuple[jax.Array, jax.Array]:
+        """[V, 3] the joint's axis in each view, signed so that positive motion is the task's, and a point on it."""
+        return self._motion_axis(self._view_scene), self._scenes.anchor[self._view_scene]
 
     def tip(self, state: EnvState) -> jax.Array:
         """[B, 3] the point between the fingertips, object frame."""

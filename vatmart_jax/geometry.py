@@ -129,6 +129,16 @@ def gripper_frame(up: jax.Array, forward: jax.Array) -> jax.Array:
     return matrix_from_rot6d(jnp.concatenate([up, forward], -1))
 
 
+def carried(point: jax.Array, axis: jax.Array, anchor: jax.Array, amount: jax.Array, hinge: bool) -> jax.Array:
+    """[..., 3] where points [..., 3] of a part come to when its joint moves by `amount` [...], rad or unit lengths.
+
+    axis: [..., 3] unit; anchor: [..., 3] a point on a hinge's axis.
+    """
+    if hinge:
+        return anchor + rotate(matrix_from_rotvec(axis * amount[..., None]), point - anchor)
+    return point + axis * amount[..., None]
+
+
 def min_jerk(u: jax.Array) -> jax.Array:
     """Quintic from 0 to 1 with zero speed and acceleration at both ends; u is clipped to [0, 1]."""
     u = jnp.clip(u, 0, 1)

@@ -29,6 +29,8 @@ class Schedule:
     """of the actions then, share of their range"""
     collect_expert: float = 0.25
     """share of these trials that the scripted expert makes, with the same noise"""
+    course: int = 300
+    """steps; for networks that have a course"""
     scorer: int = 100
     proposal: int = 600
     actionability: int = 100
@@ -68,7 +70,7 @@ class Settings:
 
 
 # Two cores: small encoders, and few probes of few proposals where the paper has the mean of the best 5 of 100.
-_ON_CPU = PerceptionConfig(networks=NetworksConfig(pointnet=SMALL), probes=4, proposals=32, best=2)
+_ON_CPU = PerceptionConfig(networks=NetworksConfig(pointnet=SMALL, course=(128, 128)), probes=4, proposals=32, best=2)
 
 PRESETS = {
     "quick": Settings(explore=ExploreConfig(iterations=60, pool=2048), perception=_ON_CPU),
@@ -76,16 +78,17 @@ PRESETS = {
         explore=ExploreConfig(iterations=100, pool=4096),
         perception=_ON_CPU,
         schedule=Schedule(
-            samples=400_000, collect=64, scorer=200, proposal=1500, actionability=200, finetune=60,
+            samples=400_000, collect=128, course=3000, scorer=200, proposal=2000, actionability=200, finetune=6,
+            finetune_batches=64, finetune_steps=1500, finetune_rate=1e-3,
         ),
     ),
     "gpu": Settings(
         env=EnvConfig(batch=4096),
         explore=ExploreConfig(iterations=300, pool=65536, td3=TD3Config(batch=1024, capacity=1_000_000)),
-        perception=PerceptionConfig(views=32),
+        perception=PerceptionConfig(networks=NetworksConfig(course=(128, 128)), views=32),
         schedule=Schedule(
-            samples=2_000_000, collect=100, scorer=10_000, proposal=10_000, actionability=3000, curiosity=30,
-            curiosity_steps=200, finetune=10, finetune_batches=20, finetune_steps=3000,
+            samples=2_000_000, collect=100, course=3000, scorer=10_000, proposal=10_000, actionability=3000,
+            curiosity=30, curiosity_steps=200, finetune=10, finetune_batches=20, finetune_steps=3000,
         ),
     ),
     # The paper's numbers where it gives them (appendix A, B): 5,000 episodes and 5,000 + 5,000 trajectories.

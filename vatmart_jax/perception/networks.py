@@ -25,6 +25,7 @@ Params = dict  # of the networks' names to their Flax parameters
 TASK_SCALE = 3.0
 MOVE_SCALE = 5.0
 TURN_SCALE = 2.0
+COURSE = 3 * WAYPOINTS + 3
 SCALE = (1.0,) * 6 + ((MOVE_SCALE,) * 3 + (TURN_SCALE,) * 3) * WAYPOINTS  # of the 30 numbers of a trajectory
 
 
@@ -53,6 +54,13 @@ class NetworksConfig:
     """Hidden widths of the trajectory scoring head."""
     actionability: tuple[int, ...] = (128, 128, 128, 128)
     """Hidden widths of the actionability head."""
+    course: tuple[int, ...] = ()
+    """Hidden widths of a head that tells where the touched point goes when the task is done; the others read what it
+    says. Without it, as in the paper, they find out for themselves."""
+
+    def __post_init__(self) -> None:
+        if self.course and self.separate:
+            raise ValueError("a course needs the shared encoder: leave out one of `course` and `separate`")
 
 
 class Features(NamedTuple):
@@ -91,15 +99,18 @@ class Networks:
         )
         f, contact, task = jnp.zeros(pointnet.feature_dim), jnp.zeros(3), jnp.zeros(())
         trajectory, z = jnp.zeros(TRAJECTORY), jnp.zeros(self.config.latent_dim)
-        keys = iter(jax.random.split(key, 7))
+        keys = iter(jax.random.split(key, 8))
         params = {
             name: PointNet2(pointnet).init(next(keys), jnp.zeros((n, 3)), grouping)["params"]
             for name in self.encoders("scorer", "proposal", "actionability")
         }
-        params["scorer"] = self._scorer.init(next(keys), f, contact, task, trajectory)["params"]
-        params["posterior"] = self._posterior.init(next(keys), f, contact, task, trajectory)["params"]
-        params["decoder"] = self._decoder.init(next(keys), f, contact, task, z)["params"]
-        params["actionability"] = self._actionability.init(next(keys), f, contact, task)["params"]
+        course = (jnp.zeros(COURSE),) if self.config.course else ()
+        params["scorer"] = self._scorer.init(next(keys), trajectory, f, contact, task, *course)["params"]
+        params["posterior"] = self._posterior.init(next(keys), trajectory, f, contact, task, *course)["params"]
+        params["decoder"] = self._decoder.init(next(keys), f, contact, task, *course, z)["params"]
+        params["actionability"] = self._actionability.init(next(keys), f, contact, task, *course)["params"]
+        if self.config.course:
+            params["course"] = self._course.init(next(keys), f, contact, task)["params"]
         return params
 
     def encoders(self, *heads: str) -> tuple[str, ...]:
@@ -121,19 +132,27 @@ class Networks:
         self, params: Params, f: Features, contact: jax.Array, task: jax.Array, trajectory: jax.Array
     ) -> jax.Array:
         """Logit [...] that the trajectory does the task; trajectories as `geometry.pack_trajectory` makes them."""
-        return self._scorer.apply({"params": params["scorer"]}, f.scorer, contact, task, trajectory)[..., 0]  # pyright: ignore
+        at = self._at(params, f, f.scorer, contact, task)
+        return self._scorer.apply({"params": params["scorer"]}, trajectory, *at)[..., 0]  # pyright: ignore
 
     def posterior(
         self, params: Params, f: Features, contact: jax.Array, task: jax.Array, trajectory: jax.Array
     ) -> tuple[jax.Array, jax.Array]:
         """Mean and log variance [..., latent] of the cVAE's encoder."""
-        out = self._posterior.apply({"params": params["posterior"]}, f.proposal, contact, task, trajectory)
+        at = self._at(params, f, f.proposal, contact, task)
+        out = self._posterior.apply({"params": params["posterior"]}, trajectory, *at)
         return tuple(jnp.split(out, 2, -1))  # pyright: ignore
 
     def decode(self, params: Params, f: Features, contact: jax.Array, task: jax.Array, z: jax.Array) -> jax.Array:
         """The decoder's raw output [..., 30]: as `propose`, the first six numbers not orthonormal."""
-        out = self._decoder.apply({"params": params["decoder"]}, f.proposal, contact, task, z)
-        return out / jnp.array(SCALE)  # pyright: ignore[reportOperatorIssue]
+        at = self._at(params, f, f.proposal, contact, task)
+        out: jax.Array = self._decoder.apply({"params": params["decoder"]}, *at, z) / jnp.array(SCALE)  # pyright: ignore
+        for course in at[3:]:  # where there is one, the decoder says how the hand departs from it
+            places, _ = places_and_turn(course)
+            steps = jnp.diff(places, axis=-2, prepend=jnp.zeros_like(places[..., :1, :]))
+            steps = jnp.concatenate([steps, jnp.zeros_like(steps)], -1).reshape(*steps.shape[:-2], 6 * WAYPOINTS)
+            out = out + jnp.concatenate([jnp.zeros_like(steps[..., :6]), steps], -1)
+        return out
 
     def propose(self, params: Params, f: Features, contact: jax.Array, task: jax.Array, z: jax.Array) -> jax.Array:
         """Trajectories [..., 30] for z [..., latent] drawn from a standard normal distribution."""
@@ -142,8 +161,21 @@ class Networks:
 
     def actionability(self, params: Params, f: Features, contact: jax.Array, task: jax.Array) -> jax.Array:
         """Logit [...] of the actionability score."""
-        head = self._actionability
-        return head.apply({"params": params["actionability"]}, f.actionability, contact, task)[..., 0]  # pyright: ignore
+        at = self._at(params, f, f.actionability, contact, task)
+        return self._actionability.apply({"params": params["actionability"]}, *at)[..., 0]  # pyright: ignore
+
+    def course(self, params: Params, f: Features, contact: jax.Array, task: jax.Array) -> jax.Array:
+        """[..., 15] what becomes of a point of the part while the task is done: where it is after each quarter,
+        relative to the contact, and the rotation vector of the part at the end; scaled (see `places_and_turn`)."""
+        return self._course.apply({"params": params["course"]}, f.scorer, contact, task)  # pyright: ignore
+
+    def _at(
+        self, params: Params, f: Features, own: jax.Array, contact: jax.Array, task: jax.Array
+    ) -> tuple[jax.Array, ...]:
+        """What every head reads: its own feature, contact, task and, where there is a head for it, the course."""
+        if not self.config.course:
+            return own, contact, task
+        return own, contact, task, jax.lax.stop_gradient(self.course(params, f, contact, task))
 
     @property
     def _scorer(self) -> TrajectoryHead:
@@ -160,6 +192,10 @@ class Networks:
     @property
     def _actionability(self) -> Head:
         return Head(self.config, (*self.config.actionability, 1))
+
+    @property
+    def _course(self) -> Head:
+        return Head(self.config, (*self.config.course, COURSE))
 
 
 class Head(nn.Module):
@@ -185,24 +221,36 @@ class TrajectoryHead(nn.Module):
     widths: tuple[int, ...]
 
     @nn.compact
-    def __call__(self, f: jax.Array, contact: jax.Array, task: jax.Array, trajectory: jax.Array) -> jax.Array:
-        x = trajectory * jnp.array(SCALE)
+    def __call__(
+        self, trajectory: jax.Array, f: jax.Array, contact: jax.Array, task: jax.Array, *course: jax.Array
+    ) -> jax.Array:
+        parts = [trajectory * jnp.array(SCALE)]
+        moved = since_start(trajectory)[..., :3]
         if self.config.positions:
-            positions = waypoint_positions(contact, trajectory)
-            x = jnp.concatenate([jnp.broadcast_to(x, (*positions.shape[:-1], TRAJECTORY)), positions], -1)
+            # What the residuals sum up to decides whether the part arrives; the encoder need not learn to add.
+            parts.append(_flat(contact[..., None, :] + moved))
+        parts += [_flat(MOVE_SCALE * (moved - places_and_turn(c)[0])) for c in course]
+        leading = jnp.broadcast_shapes(*(part.shape[:-1] for part in parts))
+        x = jnp.concatenate([jnp.broadcast_to(part, (*leading, part.shape[-1])) for part in parts], -1)
         for width in self.config.trajectory[:-1]:
             x = nn.leaky_relu(nn.Dense(width)(x))
         x = nn.Dense(self.config.trajectory[-1])(x)
-        return Head(self.config, self.widths)(f, contact, task, x)
+        return Head(self.config, self.widths)(f, contact, task, *course, x)
 
 
-def waypoint_positions(contact: jax.Array, trajectory: jax.Array) -> jax.Array:
-    """[..., 12] where the fingertips are sent, from the standoff on: contact [..., 3] and residuals summed up.
+def places_and_turn(course: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """Displacements [..., 4, 3] (unit lengths) and rotation vector [..., 3] (rad) of a course [..., 15]."""
+    places = course[..., : 3 * WAYPOINTS] / MOVE_SCALE
+    return places.reshape(*places.shape[:-1], WAYPOINTS, 3), course[..., 3 * WAYPOINTS :] / TURN_SCALE
 
-    What the sum is decides whether the part arrives; the trajectory encoder need not learn to add.
-    """
-    positions = contact[..., None, :] + since_start(trajectory)[..., :3]
-    return positions.reshape(*positions.shape[:-2], 3 * WAYPOINTS)
+
+def pack_course(places: jax.Array, turn: jax.Array) -> jax.Array:
+    """The inverse of `places_and_turn`."""
+    return jnp.concatenate([MOVE_SCALE * _flat(places), TURN_SCALE * turn], -1)
+
+
+def _flat(x: jax.Array) -> jax.Array:
+    return x.reshape(*x.shape[:-2], x.shape[-2] * x.shape[-1])
 
 
 class DenseOfParts(nn.Module):

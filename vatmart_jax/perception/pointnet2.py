@@ -57,6 +57,8 @@ class PointNetConfig:
     """Width of a query's feature."""
     around: tuple[Around, ...] = ()
     """Groups about the queries themselves; the paper has none."""
+    context: tuple[int, ...] = ()
+    """Widths of a network over all of the second level's centroids as each query sees them; the paper has none."""
 
     def __post_init__(self) -> None:
         if len(self.levels) != len(self.propagation):
@@ -72,6 +74,7 @@ SMALL = PointNetConfig(
     ),
     propagation=((128, 128), (128, 128), (256, 128)),
     around=(Around(0.06, 16, (32, 32, 64)), Around(0.15, 32, (32, 32, 64))),
+    context=(32, 64),
 )
 """A ninth of the paper's arithmetic per view, for two CPU cores."""
 
@@ -209,13 +212,14 @@ class PointNet2(nn.Module):
         """points: [N, 3]. which: [Q] int into the queries, None for all. Returns [Q, feature_dim]."""
         levels = self.config.levels
         xyz = points.astype(jnp.float32)
-        skips = [xyz]
+        skips, centroids = [xyz], [xyz]
         for level, chosen, members in zip(levels, grouping.centroids, grouping.neighbours, strict=True):
             centres = _take(xyz, chosen)
             offset = (_take(xyz, members) - centres[:, None]) / level.radius
             grouped = jnp.concatenate([offset, _take(skips[-1], members)], -1)
             skips.append(Shared(level.widths)(grouped).max(-2))
             xyz = centres
+            centroids.append(xyz)
         skips[0] = grouping.queries if which is None else _take(grouping.queries, which)
         features = skips[-1]
         for depth in reversed(range(len(levels))):
@@ -231,6 +235,12 @@ class PointNet2(nn.Module):
             # A query with no point near has one from elsewhere, at a distance that means nothing.
             inside = jnp.sum(offset**2, -1, keepdims=True) <= 1.01
             parts.append(jnp.where(inside, Shared(kind.widths)(offset), 0.0).max(-2))
+        if self.config.context:
+            # A dense layer of a centroid's feature and its offset from the query, the sum of what each contributes.
+            width, *more = self.config.context
+            place = nn.Dense(width, use_bias=False, name="context_place")
+            seen = nn.Dense(width, name="context_seen")(skips[2]) + place(centroids[2])
+            parts.append(Shared(tuple(more))(nn.relu(seen - place(skips[0])[:, None])).max(-2))
         return Shared((self.config.feature_dim,))(jnp.concatenate(parts, -1))
 
 

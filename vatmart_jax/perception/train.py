@@ -19,9 +19,9 @@ from flax import struct
 
 from vatmart_jax.bank import ViewBank
 from vatmart_jax.errors import UserError
-from vatmart_jax.geometry import WAYPOINTS
+from vatmart_jax.geometry import WAYPOINTS, carried
 from vatmart_jax.perception import losses
-from vatmart_jax.perception.networks import Features, Networks, NetworksConfig, Params
+from vatmart_jax.perception.networks import Features, Networks, NetworksConfig, Params, pack_course, places_and_turn
 from vatmart_jax.perception.pointnet2 import Grouping, PointNetConfig, group
 
 
@@ -31,6 +31,7 @@ class Clouds:
 
     points: jax.Array  # [V, N, 3] float16, object frame
     grouping: Grouping
+    joints: tuple[jax.Array, jax.Array] | None = None  # [V, 3] axes and anchors, see Env.joints; labels, never inputs
 
     @property
     def contacts(self) -> jax.Array:
@@ -105,7 +106,7 @@ class PerceptionConfig:
     scale: float = 0.2
     """augmentation: views, and what happens in them, grow or shrink by up to this share"""
     task_is_length: bool = False
-    """tasks grow with the view (drawers)"""
+    """drawers: tasks grow with the view, parts move along their axis and do not turn"""
     learning_rate: float = 1e-3
     """after 100 steps of warm-up; falls along a cosine to a fiftieth at the stage's end"""
     weight_decay: float = 1e-4
@@ -122,6 +123,8 @@ class PerceptionConfig:
     """of the KL divergence; at 0.05 the decoder's samples ignore contact and task"""
     kl_free: float = 3.0
     """nats of it that cost nothing, so that the posterior does not collapse before the decoder has learned to listen"""
+    course_weight: float = 50.0
+    """of the L1 of the touched point's course"""
     actionability_weight: float = 5.0
     """of the L1 of actionability"""
     steps_per_call: int = 50
@@ -143,12 +146,13 @@ class PerceptionState:
 
 
 STAGES: dict[str, tuple[str, ...]] = {
-    "scorer": ("scorer",),
-    "proposal": ("scorer", "proposal"),
+    "course": ("course",),
+    "scorer": ("course", "scorer"),
+    "proposal": ("course", "scorer", "proposal"),
     "actionability": ("actionability",),
-    "joint": ("scorer", "proposal", "actionability"),
+    "joint": ("course", "scorer", "proposal", "actionability"),
 }
-"""The heads that each stage trains; those not named stay as they are.
+"""The heads that each stage trains; those not named stay as they are. A shared encoder learns wherever the course does.
 
 The scorer goes on learning beside the proposals, which would otherwise bend a shared encoder away from it; with
 actionability it rests, for it makes the targets.
@@ -177,6 +181,7 @@ class Batch(NamedTuple):
     achieved: jax.Array  # [V, Q] the cVAE's task
     weight: jax.Array  # [V, Q] float, 1 where the cVAE learns from the row
     probe_task: jax.Array  # [V, R]
+    joints: tuple[jax.Array, jax.Array] | None  # [V, 3] axes and anchors, where the networks have a course to learn
 
 
 class Selection(NamedTuple):
@@ -241,6 +246,8 @@ def train(
     index = _index(samples, len(clouds))
     if int(index.n_filled) == 0:
         raise ValueError(f"nothing to train the {stage} stage on: the buffer has no samples")
+    if config.networks.course and clouds.joints is None:
+        raise ValueError("the networks' course has nothing to learn from: the clouds come without joints")
     done = int(state.step)
     if done == 0:  # the moments of the last stage belong to other losses
         state = replace(state, optimizer=_moments(config, state.params))
@@ -396,6 +403,7 @@ def _draw(key: jax.Array, clouds: Clouds, samples: Samples, index: Index, config
             jnp.where(achieved, moved, config.low),
             achieved.astype(jnp.float32),
             commanded[:, : config.probes],
+            jax.tree.map(lambda a: a[view], clouds.joints) if config.networks.course else None,
         ),
     )
 
@@ -454,6 +462,11 @@ def transformed(
     is_euler, is_move = (number >= 3) & (number % 2 == 1), (number >= 2) & (number % 2 == 0)
     triples = jnp.where(is_euler, triples, triples @ turn) * jnp.where(is_move, scale, 1.0)
     of_tasks = lambda t: t * scale if task_is_length else t  # noqa: E731
+    if batch.joints is not None:
+        axis, anchor = map(of_vectors, batch.joints)
+        # The mirror image of a turn goes the other way about the mirrored axis.
+        axis = axis if task_is_length else jnp.where(mirrored, -axis, axis)
+        batch = batch._replace(joints=(axis, anchor * scale))
     return batch._replace(
         points=of_vectors(batch.points) * scale,
         grouping=replace(batch.grouping, queries=of_vectors(batch.grouping.queries) * scale),
@@ -475,6 +488,14 @@ def _loss(
     n = batch.task.shape[1]
     of_samples, of_probes = Features(*(x[:, :n] for x in f)), Features(*(x[:, n:] for x in f))
     total, metrics = jnp.float32(0), {}
+    if "course" in heads and config.networks.course:
+        task = jnp.concatenate([batch.task, batch.probe_task], -1)
+        truth = true_course(contact, *batch.joints, task, hinge=not config.task_is_length)  # pyright: ignore
+        found = networks.course(params, f, contact, task)
+        loss = jnp.abs(found - truth).mean()
+        off = (places_and_turn(found)[0] - places_and_turn(truth)[0])[..., -1, :]
+        total += config.course_weight * loss
+        metrics |= {"course_loss": loss, "course_error": jnp.linalg.norm(off, axis=-1).mean()}
     if "scorer" in heads:
         logits = networks.score(params, of_samples, contact[:, :n], batch.task, batch.trajectory)
         loss = losses.score_loss(logits, batch.label)
@@ -503,11 +524,23 @@ def _loss(
     return total, metrics | {"loss": total}
 
 
+def true_course(contact: jax.Array, axis: jax.Array, anchor: jax.Array, task: jax.Array, hinge: bool) -> jax.Array:
+    """[V, Q, 15] what `Networks.course` should say of contacts [V, Q, 3] and tasks [V, Q] where the joints are axis
+    and anchor [V, 3]."""
+    axis, anchor = axis[:, None], anchor[:, None]
+    quarters = jnp.arange(1, WAYPOINTS + 1) / WAYPOINTS
+    places = jnp.stack([carried(contact, axis, anchor, task * q, hinge) - contact for q in quarters], -2)
+    turn = axis * task[..., None] * (1.0 if hinge else 0.0)
+    return pack_course(places, turn)
+
+
 def _trained(config: PerceptionConfig, stage: str) -> set[str]:
     """Names in the parameters of the networks that a stage trains."""
     heads = STAGES[stage]
+    if not config.networks.course:
+        heads = tuple(head for head in heads if head != "course")
     names = {name for head in heads for name in (("posterior", "decoder") if head == "proposal" else (head,))}
-    if config.networks.separate or "scorer" in heads:
+    if config.networks.separate or "course" in STAGES[stage]:
         names |= set(Networks(config.networks).encoders(*heads))
     return names
 

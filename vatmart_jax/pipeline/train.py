@@ -23,7 +23,7 @@ from vatmart_jax.pipeline.explore import Explorer, ExploreState, start_pool
 from vatmart_jax.pipeline.run import Run
 from vatmart_jax.presets import Settings
 
-STAGES = ("explore", "collect", "scorer", "proposal", "actionability", "curiosity", "finetune")
+STAGES = ("explore", "collect", "course", "scorer", "proposal", "actionability", "curiosity", "finetune")
 _SECONDS_BETWEEN_CHECKPOINTS = 20.0
 
 Report = Callable[[str, int, int, dict[str, float]], None]  # stage, done, total, metrics
@@ -93,11 +93,12 @@ class Training:
     def clouds(self) -> Clouds:
         """The environment's views as the networks read them."""
         if self._clouds is None:
-            self._clouds = perception.clouds_of(
+            clouds = perception.clouds_of(
                 self._env.views,
                 self.config.networks.pointnet,
                 lambda done, total: self._report("group views", done, total, {}),
             )
+            self._clouds = replace(clouds, joints=self._env.joints())
         return self._clouds
 
     def pool(self) -> Start:
@@ -150,6 +151,9 @@ class Training:
             }
             progress = self._tick(progress.with_samples(samples), "collect", done + 1, schedule.collect, metrics)
         return progress
+
+    def _course(self, progress: Progress) -> Progress:
+        return self._learn(progress, "course", self._settings.schedule.course if self.config.networks.course else 0)
 
     def _scorer(self, progress: Progress) -> Progress:
         return self._learn(progress, "scorer", self._settings.schedule.scorer)
