@@ -8,6 +8,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
+from filelock import FileLock
 
 from vatmart_jax import __version__
 from vatmart_jax.bank import SceneBank, ViewBank
@@ -33,24 +34,26 @@ def cache_folder() -> Path:
 
 
 def prepare(data: Path | None, convert: Callable[[Path, Path], None], generate: Callable[[Path], None]) -> Path:
-    """The converted folder (scenes.npz, views.npz) for `data`, made in the cache where it does not exist yet.
+    """The converted folder (scenes.npz, views.npz) for `data`, made in the cache where it does not exist yet; of several
+    runs that start at once, one makes it and the others wait.
 
     data: a converted folder, a folder of PartNet-Mobility objects, or None for the bundled objects.
     convert(source, out) and generate(out) do the work. Raises DataError where `data` is neither.
     """
-    if data is None:
-        objects = cache_folder() / f"objects-{__version__}-{BUNDLED_COUNT}-{BUNDLED_SEED}"
-        generate(objects)
-        data = objects
-    elif not data.is_dir():
-        raise DataError(f"{data}: no such folder; {_WANTED}")
-    if (data / "scenes.npz").is_file():
+    if data is not None and (data / "scenes.npz").is_file():
         return data
-    if (data / "mobility.urdf").is_file() or not any(data.glob("*/mobility*.urdf")):
+    if data is not None and not data.is_dir():
+        raise DataError(f"{data}: no such folder; {_WANTED}")
+    if data is not None and ((data / "mobility.urdf").is_file() or not any(data.glob("*/mobility*.urdf"))):
         raise DataError(f"{data}: holds neither scenes.npz nor object folders with a mobility.urdf; {_WANTED}")
-    name = hashlib.sha256(str(data.resolve()).encode()).hexdigest()[:16]
-    out = cache_folder() / "converted" / name
-    convert(data, out)
+    cache = cache_folder()
+    cache.mkdir(parents=True, exist_ok=True)
+    with FileLock(cache / "prepare.lock"):
+        if data is None:
+            data = cache / f"objects-{__version__}-{BUNDLED_COUNT}-{BUNDLED_SEED}"
+            generate(data)
+        out = cache / "converted" / hashlib.sha256(str(data.resolve()).encode()).hexdigest()[:16]
+        convert(data, out)
     return out
 
 
