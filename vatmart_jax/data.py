@@ -34,8 +34,9 @@ def cache_folder() -> Path:
 
 
 def prepare(data: Path | None, convert: Callable[[Path, Path], None], generate: Callable[[Path], None]) -> Path:
-    """The converted folder (scenes.npz, views.npz) for `data`, made in the cache where it does not exist yet; of several
-    runs that start at once, one makes it and the others wait.
+    """The converted folder (scenes.npz, views.npz) for `data`, made in the cache where it does not exist yet.
+
+    Of several runs that start at once, one makes it and the others wait.
 
     data: a converted folder, a folder of PartNet-Mobility objects, or None for the bundled objects.
     convert(source, out) and generate(out) do the work. Raises DataError where `data` is neither.
