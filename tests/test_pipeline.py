@@ -28,12 +28,13 @@ TINY = Settings(
     explore=ExploreConfig(td3=TD3Config(hidden=32, batch=32, capacity=1000, updates=4), iterations=4, pool=32),
     perception=PerceptionConfig(
         networks=NetworksConfig(
-            pointnet=PointNetConfig(64, (Level(16, 0.3, 4, (16,)), Level(4, 0.8, 4, (16,))), ((16,), (16,)), 16)
+            pointnet=PointNetConfig(64, (Level(16, 0.3, 4, (16,)), Level(4, 0.8, 4, (16,))), ((16,), (16,)), 16),
+            course=(16,),
         ),
         views=2, queries=4, probes=2, proposals=4, best=2, steps_per_call=3,
     ),
     schedule=Schedule(
-        samples=512, collect=2, scorer=6, proposal=6, actionability=3, curiosity=2, curiosity_iterations=1,
+        samples=512, collect=2, course=3, scorer=6, proposal=6, actionability=3, curiosity=2, curiosity_iterations=1,
         curiosity_steps=3, finetune=1, finetune_batches=1, finetune_steps=3,
     ),
     evaluation=EvaluationConfig(trials=24, proposals=4),
@@ -70,7 +71,7 @@ def test_a_run_leaves_everything_its_readers_need(finished):
     assert {row["method"] for row in result["results"]} == {"ours", "random"}
     stages = [json.loads(line)["stage"] for line in (out / "metrics.jsonl").read_text().splitlines()]
     assert list(dict.fromkeys(stages)) == [
-        "explore", "collect", "scorer", "proposal", "actionability", "curiosity", "finetune",
+        "explore", "collect", "course", "scorer", "proposal", "actionability", "curiosity", "finetune",
     ]  # fmt: skip
 
 

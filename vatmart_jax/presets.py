@@ -40,11 +40,11 @@ class Schedule:
     curiosity_steps: int = 50
     curiosity_weight: float = 500.0
     """penalty for a successful trajectory the scorer is sure of; the paper's 500"""
-    finetune: int = 6
+    finetune: int = 4
     """rounds of labelling the networks' own proposals in simulation and training on them jointly"""
-    finetune_batches: int = 6
-    finetune_steps: int = 250
-    finetune_rate: float = 5e-4
+    finetune_batches: int = 12
+    finetune_steps: int = 400
+    finetune_rate: float = 1e-3
     """learning rate of curiosity and finetune rounds"""
 
 
@@ -78,8 +78,8 @@ PRESETS = {
         explore=ExploreConfig(iterations=100, pool=4096),
         perception=_ON_CPU,
         schedule=Schedule(
-            samples=400_000, collect=128, course=3000, scorer=200, proposal=2000, actionability=200, finetune=6,
-            finetune_batches=64, finetune_steps=1500, finetune_rate=1e-3,
+            samples=400_000, collect=128, course=3000, scorer=200, proposal=2000, actionability=200, finetune=16,
+            finetune_batches=64, finetune_steps=1500,
         ),
     ),
     "gpu": Settings(
