@@ -3,6 +3,7 @@
 python experiments/pretrain.py --run RUN --name push-door
 """
 
+import json
 import shutil
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,10 +15,12 @@ from vatmart_jax.files import whole_folder, write_json
 from vatmart_jax.inference import Priors
 from vatmart_jax.pipeline.run import read_config
 
+RESULTS = Path(__file__).parent / "results"
+
 
 @dataclass(frozen=True)
 class Pretrain:
-    """Copy a run's priors, policy and config into the package."""
+    """Copy a run's priors, policy and config into the package, and its result and curves beside the other results."""
 
     run: Path
     """run folder of `vatmart train`"""
@@ -31,6 +34,11 @@ def main(args: Pretrain) -> None:
         write_json(folder / "config.json", config)
         priors.save(folder / "priors")
         shutil.copyfile(args.run / "policy.msgpack", folder / "policy.msgpack")
+    result = json.loads((args.run / "result.json").read_text()) | {"run": args.name}
+    lines = [json.loads(line) for line in (args.run / "metrics.jsonl").read_text().splitlines()]
+    for stage in ("explore", "finetune"):
+        result[f"{stage}_success"] = [round(line["success"], 3) for line in lines if line["stage"] == stage]
+    write_json(RESULTS / f"train-{args.name}.json", result)
 
 
 if __name__ == "__main__":

@@ -24,6 +24,7 @@ TINY = PointNetConfig(
     levels=(Level(40, 0.3, 8, (16, 16)), Level(8, 0.8, 8, (16, 32))),
     propagation=((16,), (32,)),
     around=(Around(0.2, 8, (16,)),),
+    context=(8, 16),
 )
 
 
@@ -132,3 +133,5 @@ def test_every_parameter_has_a_gradient() -> None:
 def test_levels_and_propagations_must_match() -> None:
     with pytest.raises(ValueError, match="2 levels need as many propagations, not 1"):
         PointNetConfig(levels=TINY.levels, propagation=((16,),))
+    with pytest.raises(ValueError, match="a context needs two levels"):
+        PointNetConfig(levels=TINY.levels[:1], propagation=((16,),), context=(8,))

@@ -462,7 +462,7 @@ def _prepared(data: Path | None, say: Callable[[str], None], points: int = 0) ->
             with whole_folder(out) as part:
                 generate(part, BUNDLED_COUNT, BUNDLED_SEED)
 
-    return prepare(data, convert_into, make)
+    return prepare(data, convert_into, make, say)
 
 
 def _enable_compilation_cache() -> None:

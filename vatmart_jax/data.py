@@ -8,7 +8,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
-from filelock import FileLock
+from filelock import FileLock, Timeout
 
 from vatmart_jax import __version__
 from vatmart_jax.bank import SceneBank, ViewBank
@@ -33,28 +33,39 @@ def cache_folder() -> Path:
     return Path(base) / "vatmart_jax"
 
 
-def prepare(data: Path | None, convert: Callable[[Path, Path], None], generate: Callable[[Path], None]) -> Path:
+def prepare(
+    data: Path | None,
+    convert: Callable[[Path, Path], None],
+    generate: Callable[[Path], None],
+    say: Callable[[str], None] = lambda line: None,
+) -> Path:
     """The converted folder (scenes.npz, views.npz) for `data`, made in the cache where it does not exist yet.
 
-    Of several runs that start at once, one makes it and the others wait.
+    Of several runs that want the same data at once, one makes it; the others `say` that they wait, and do.
 
     data: a converted folder, a folder of PartNet-Mobility objects, or None for the bundled objects.
     convert(source, out) and generate(out) do the work. Raises DataError where `data` is neither.
     """
-    if data is not None and (data / "scenes.npz").is_file():
-        return data
-    if data is not None and not data.is_dir():
-        raise DataError(f"{data}: no such folder; {_WANTED}")
-    if data is not None and ((data / "mobility.urdf").is_file() or not any(data.glob("*/mobility*.urdf"))):
-        raise DataError(f"{data}: holds neither scenes.npz nor object folders with a mobility.urdf; {_WANTED}")
-    cache = cache_folder()
-    cache.mkdir(parents=True, exist_ok=True)
-    with FileLock(cache / "prepare.lock"):
+    source = data or cache_folder() / f"objects-{__version__}-{BUNDLED_COUNT}-{BUNDLED_SEED}"
+    if data is not None:
+        if not data.is_dir():
+            raise DataError(f"{data}: no such folder; {_WANTED}")
+        if (data / "scenes.npz").is_file():
+            return data
+        if (data / "mobility.urdf").is_file() or not any(data.glob("*/mobility*.urdf")):
+            raise DataError(f"{data}: holds neither scenes.npz nor object folders with a mobility.urdf; {_WANTED}")
+    out = cache_folder() / "converted" / hashlib.sha256(str(source.resolve()).encode()).hexdigest()[:16]
+    out.parent.mkdir(parents=True, exist_ok=True)
+    lock = FileLock(out.with_suffix(".lock"))
+    try:
+        held = lock.acquire(timeout=0)
+    except Timeout:
+        say(f"waiting for another run that converts {source}")
+        held = lock.acquire()
+    with held:
         if data is None:
-            data = cache / f"objects-{__version__}-{BUNDLED_COUNT}-{BUNDLED_SEED}"
-            generate(data)
-        out = cache / "converted" / hashlib.sha256(str(data.resolve()).encode()).hexdigest()[:16]
-        convert(data, out)
+            generate(source)
+        convert(source, out)
     return out
 
 

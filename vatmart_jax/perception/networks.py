@@ -147,10 +147,10 @@ class Networks:
         """The decoder's raw output [..., 30]: as `propose`, the first six numbers not orthonormal."""
         at = self._at(params, f, f.proposal, contact, task)
         out: jax.Array = self._decoder.apply({"params": params["decoder"]}, *at, z) / jnp.array(SCALE)  # pyright: ignore
-        for course in at[3:]:  # where there is one, the decoder says how the hand departs from it
-            places, _ = places_and_turn(course)
-            steps = jnp.diff(places, axis=-2, prepend=jnp.zeros_like(places[..., :1, :]))
-            steps = jnp.concatenate([steps, jnp.zeros_like(steps)], -1).reshape(*steps.shape[:-2], 6 * WAYPOINTS)
+        if self.config.course:  # then the decoder says how the hand departs from it
+            places, _ = places_and_turn(at[-1])
+            steps = jnp.diff(places, axis=-2, prepend=0.0)
+            steps = _flat(jnp.concatenate([steps, jnp.zeros_like(steps)], -1))
             out = out + jnp.concatenate([jnp.zeros_like(steps[..., :6]), steps], -1)
         return out
 

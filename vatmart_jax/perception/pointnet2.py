@@ -63,6 +63,8 @@ class PointNetConfig:
     def __post_init__(self) -> None:
         if len(self.levels) != len(self.propagation):
             raise ValueError(f"{len(self.levels)} levels need as many propagations, not {len(self.propagation)}")
+        if self.context and len(self.levels) < 2:
+            raise ValueError("a context needs two levels, for it is made of the second's centroids")
 
 
 SMALL = PointNetConfig(
