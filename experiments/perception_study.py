@@ -55,7 +55,12 @@ def changed(settings: Any, field: str, text: str) -> Any:
     value = getattr(settings, name, None)
     if name not in {f.name for f in fields(settings)} or bool(rest) != is_dataclass(value):
         raise UserError(f"--variants ... {field}={text}: no such field of the settings")
-    return replace(settings, **{name: changed(value, rest, text) if rest else type(value)(float(text))})
+    if rest:
+        return replace(settings, **{name: changed(value, rest, text)})
+    try:
+        return replace(settings, **{name: type(value)(float(text))})
+    except (TypeError, ValueError) as e:
+        raise UserError(f"--variants ... {field}={text}: {e}") from e
 
 
 def main(args: Study) -> None:
@@ -79,10 +84,12 @@ def main(args: Study) -> None:
                 training = Training(run, envs["train"], own, described["seed"], bars)
                 begun = done.replace(
                     perception=perception.begin(training.key("networks"), training.config),
-                    stage=jnp.int32(STAGES.index("scorer")), done=jnp.int32(0), seconds=jnp.zeros(len(STAGES)),
+                    stage=jnp.int32(STAGES.index("course")), done=jnp.int32(0), seconds=jnp.zeros(len(STAGES)),
                 )  # fmt: skip
                 progress = training.train(begun)
-            described_priors = PriorsConfig(task.name, task.low, task.high, training.config.networks)
+            described_priors = PriorsConfig(
+                task.name, task.low, task.high, own.evaluation.copies, training.config.networks
+            )
             priors = Priors(described_priors, progress.perception.params)
             rows = []
             for number, (split, env) in enumerate(envs.items()):

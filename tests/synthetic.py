@@ -6,8 +6,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from vatmart_jax.perception.clouds import Clouds
 from vatmart_jax.perception.pointnet2 import PointNetConfig, group
-from vatmart_jax.perception.train import Clouds, Samples
+from vatmart_jax.perception.train import Samples
 
 
 def boxes(seed: int, views: int, config: PointNetConfig, contacts: int = 32) -> tuple[Clouds, np.ndarray]:
@@ -64,5 +65,5 @@ def samples(seed: int, clouds: Clouds, normals: np.ndarray, count: int, task=(0.
     moved, valid = outcome(clouds, normals, view, contact, trajectory)
     return Samples(
         jnp.asarray(view, jnp.int32), jnp.asarray(contact, jnp.int32), jnp.asarray(commanded, jnp.float32),
-        jnp.asarray(trajectory), jnp.asarray(moved, jnp.float32), jnp.asarray(valid),
+        jnp.asarray(trajectory), jnp.asarray(moved, jnp.float32), jnp.asarray(valid), jnp.zeros(count, bool),
     )  # fmt: skip

@@ -13,8 +13,11 @@ from synthetic import boxes, outcome, samples
 from vatmart_jax import geometry as g
 from vatmart_jax.perception import losses
 from vatmart_jax.perception import train as t
+from vatmart_jax.perception.ask import Ensemble, propose_trajectories, score_trajectories, select_actions
+from vatmart_jax.perception.clouds import Clouds
 from vatmart_jax.perception.networks import DenseOfParts, Features, Networks, NetworksConfig, places_and_turn
 from vatmart_jax.perception.pointnet2 import Level, PointNetConfig
+from vatmart_jax.perception.transform import Transform, spread
 from vatmart_jax.presets import PRESETS
 
 TINY = PointNetConfig(
@@ -29,7 +32,7 @@ COURSE = replace(CONFIG, networks=NetworksConfig(pointnet=TINY, course=(64,)))
 
 
 @pytest.fixture(scope="module")
-def world() -> tuple[t.Clouds, np.ndarray]:
+def world() -> tuple[Clouds, np.ndarray]:
     return boxes(0, 60, TINY)
 
 
@@ -149,13 +152,30 @@ def test_batches_hold_true_labels_and_only_filled_rows(world, data) -> None:
         assert (batch.probe_task >= CONFIG.low).all() and (batch.which < clouds.contacts.shape[1]).all()
 
 
+def transform(mirrored: bool) -> Transform:
+    return Transform(jnp.array(mirrored), jnp.float32(0.7), jnp.float32(1.2))
+
+
+def test_a_batch_has_its_share_of_own_proposals_where_there_are_both_kinds(world, data) -> None:
+    clouds = world[0]
+    rows = jnp.arange(len(data.view))
+    # Views 0 and 1 have both kinds, 2 only proposals, 3 only others; the contact tells them apart.
+    view, proposed = rows % 4, (rows % 4 == 2) | ((rows % 4 < 2) & (rows % 32 < 4))
+    marked = data.replace(view=view, proposed=proposed, contact=proposed.astype(jnp.int32))
+    batch = t._draw(jax.random.key(0), clouds, marked, t._index(marked, len(clouds)), replace(CONFIG, views=64))
+    own = np.asarray(batch.which[:, : CONFIG.queries]) == 1
+    np.testing.assert_allclose(np.sort(own.mean(1))[[0, -1]], [0, 1])
+    mixed = own[(own.any(1)) & (~own.all(1))]
+    assert 20 < len(mixed) < 44 and abs(mixed.mean() - 0.5) < 0.05
+
+
 def test_mirrored_turned_and_scaled_scenes_have_motions_to_match(world, data) -> None:
     clouds, _ = world
     index = t._index(data, len(clouds))
     batch = t._draw(jax.random.key(0), clouds, data, index, replace(CONFIG, mirror=False))
     one = jax.tree.map(lambda a: a[0], batch)
     for mirrored in (False, True):
-        found = t.transformed(one, jnp.array(mirrored), jnp.float32(0.7), jnp.float32(1.2), task_is_length=mirrored)
+        found = t.transformed(one, transform(mirrored), task_is_length=mirrored)
         turn = g.matrix_from_rotvec(jnp.array([0.0, 0.0, 0.7]))
         whole = turn @ jnp.diag(jnp.array([1.0, -1.0 if mirrored else 1.0, 1.0]))
         np.testing.assert_allclose(found.points, 1.2 * one.points @ whole.T, atol=1e-5)
@@ -179,7 +199,7 @@ def test_the_course_of_a_mirrored_turned_and_scaled_scene_is_that_of_the_scene(w
     one = jax.tree.map(lambda a: a[0], batch)
     contact, task = one.grouping.queries[one.which[: CONFIG.queries]], one.task
     for mirrored, hinge in ((False, True), (True, True), (True, False)):
-        found = t.transformed(one, jnp.array(mirrored), jnp.float32(0.7), jnp.float32(1.2), task_is_length=not hinge)
+        found = t.transformed(one, transform(mirrored), task_is_length=not hinge)
         whole = g.matrix_from_rotvec(jnp.array([0.0, 0.0, 0.7])) @ jnp.diag(jnp.array([1.0, 1 - 2.0 * mirrored, 1.0]))
         course = lambda joints, contact, task: places_and_turn(  # noqa: E731
             t.true_course(contact[None], *(x[None] for x in joints), task[None], hinge)[0]  # noqa: B023
@@ -194,6 +214,44 @@ def test_the_course_of_a_mirrored_turned_and_scaled_scene_is_that_of_the_scene(w
             np.testing.assert_allclose(
                 g.rotate(g.matrix_from_rotvec(turn0), arm) + anchor, contact + places0[:, -1], atol=1e-5
             )
+
+
+@pytest.mark.parametrize("mirrored", [False, True])
+def test_an_inverse_transform_undoes_it(data, mirrored: bool) -> None:
+    there, back = transform(mirrored), transform(mirrored).inverse
+    points = jax.random.normal(jax.random.key(0), (5, 3))
+    np.testing.assert_allclose(back.points(there.points(points)), points, atol=1e-5)
+    again = back.trajectory(there.trajectory(data.trajectory))
+    np.testing.assert_allclose(again, data.trajectory, atol=1e-5)
+    assert float(back.task(there.task(jnp.float32(0.3), True), True)) == pytest.approx(0.3)
+
+
+def test_an_ensemble_says_the_mean_over_copies_and_proposes_in_all_of_them(world, data) -> None:
+    clouds, networks = world[0], Networks(COURSE.networks)
+    params, ensemble = t.begin(jax.random.key(0), COURSE).params, Ensemble(networks, 3, task_is_length=True)
+    points, grouping = jax.tree.map(lambda a: a[0], (clouds.points, clouds.grouping))
+    contact, task, which = clouds.contacts[0, :4], jnp.linspace(0.1, 0.4, 4), jnp.arange(4)
+    scores, actionabilities, features = [], [], []
+    for copy in range(3):
+        one = jax.tree.map(lambda a: a[copy], spread(3))  # noqa: B023
+        queries = one.points(grouping.queries)
+        f = networks.features(params, one.points(points), grouping.replace(queries=queries), which)
+        asked = one.points(contact), one.task(task, True)
+        scores.append(jax.nn.sigmoid(networks.score(params, f, *asked, one.trajectory(data.trajectory[:4]))))
+        actionabilities.append(jax.nn.sigmoid(networks.actionability(params, f, *asked)))
+        features.append((one, f, asked))
+    f = ensemble.features(params, points, grouping, which)
+    close = partial(np.testing.assert_allclose, rtol=2e-3, atol=2e-4)
+    close(ensemble.score(params, f, contact, task, data.trajectory[:4]), sum(scores) / 3)
+    close(ensemble.actionability(params, f, contact, task), sum(actionabilities) / 3)
+    assert np.std(scores, 0).max() > 1e-3  # the copies differ in what they say
+    proposed, said = ensemble.propose(params, f, contact, task, jax.random.key(1), 8)
+    assert proposed.shape == (4, 8, 30) and said.shape == (4, 8)
+    z = jax.random.normal(jax.random.key(1), (3, 3, networks.config.latent_dim))
+    for copy, (one, of_copy, asked) in enumerate(features):
+        lifted = Features(*(x[:, None] for x in of_copy)), asked[0][:, None], asked[1][:, None]
+        mine = proposed[:, 3 * copy : 3 * copy + 3]
+        close(one.trajectory(mine), networks.propose(params, *lifted, z[copy, : mine.shape[1]]))
 
 
 def test_a_course_can_be_learned_and_is_asked_for_labels(world, data) -> None:
@@ -251,23 +309,23 @@ def test_the_networks_learn_a_world_that_can_be_learned(world, fresh) -> None:
     config = replace(CONFIG, views=8, queries=48, steps_per_call=100)
     state = t.train(fresh, clouds, data, config, "proposal", 700)
     state = t.train(state, clouds, data, config, "actionability", 200)
-    networks, (clouds, normals) = Networks(config.networks), boxes(10, 64, TINY)
+    ensemble, (clouds, normals) = Ensemble(Networks(config.networks)), boxes(10, 64, TINY)
     tests, rng = samples(11, clouds, normals, 1000), np.random.default_rng(12)
     moved, valid = np.asarray(tests.moved), np.asarray(tests.valid)
     task = np.clip(moved * np.exp(rng.choice([0.05, 0.6], 1000) * rng.uniform(-1, 1, 1000)), 0.1, 0.5)
     label = valid & (np.abs(moved - task) <= 0.15 * task)
-    score = t.score_trajectories(
-        networks, state.params, clouds, tests.view, tests.contact, jnp.asarray(task, jnp.float32), tests.trajectory
+    score = score_trajectories(
+        ensemble, state.params, clouds, tests.view, tests.contact, jnp.asarray(task, jnp.float32), tests.trajectory
     )
     auc = roc_auc_score(label, score)
     view, task = jnp.arange(128) % 64, jnp.asarray(rng.uniform(0.15, 0.4, 128), jnp.float32)
-    chosen = t.select_actions(networks, state.params, clouds, view, task, jax.random.key(1))
+    chosen = select_actions(ensemble, state.params, clouds, view, task, jax.random.key(1))
     moved, valid = outcome(clouds, normals, np.asarray(view), np.asarray(chosen.contact), chosen.trajectory)
     success = (valid & (np.abs(moved - task) <= 0.15 * task)).mean()
     point = np.asarray(clouds.contacts)
     upper = point[..., 2] > point[..., 2].mean(1, keepdims=True)
-    proposed, _ = t.propose_trajectories(
-        networks, state.params, clouds, view, jnp.asarray(upper.argmax(1))[view], task, jax.random.key(2), 20
+    proposed, _ = propose_trajectories(
+        ensemble, state.params, clouds, view, jnp.asarray(upper.argmax(1))[view], task, jax.random.key(2), 20
     )
     moved, valid = outcome(clouds, normals, np.asarray(view), upper.argmax(1)[np.asarray(view)], proposed)
     conditional = (valid & (np.abs(moved - task[:, None]) <= 0.15 * task[:, None])).mean()

@@ -28,6 +28,7 @@ from vatmart_jax.errors import UserError, one_of
 from vatmart_jax.expert import expert_action
 from vatmart_jax.geometry import TRAJECTORY, WAYPOINTS
 from vatmart_jax.perception import train as perception
+from vatmart_jax.perception.clouds import clouds_of
 from vatmart_jax.perception.networks import Networks
 from vatmart_jax.perception.pointnet2 import group
 from vatmart_jax.physics.controller import hand_target, waypoint_controls
@@ -200,7 +201,7 @@ def bench_perception(choice: Choice, preset: str, seed: int, seconds: float) -> 
     views = views.select(rng.permutation(len(views))[: 2 * config.views])
     views = replace(views, points=_with_points(rng, views.points, max(10_000, pointnet.n_points)))
     upright = jnp.broadcast_to(jnp.array([0.0, 0.0, 1.0]), (len(views), 3))
-    clouds = perception.clouds_of(views, pointnet).replace(joints=(upright, jnp.zeros((len(views), 3))))
+    clouds = clouds_of(views, pointnet).replace(joints=(upright, jnp.zeros((len(views), 3))))
     rows = 4 * config.views * config.queries
     samples = perception.Samples(
         view=jnp.asarray(rng.integers(0, len(views), rows), jnp.int32),
@@ -209,6 +210,7 @@ def bench_perception(choice: Choice, preset: str, seed: int, seconds: float) -> 
         trajectory=jnp.asarray(rng.normal(size=(rows, TRAJECTORY)), jnp.float32),
         moved=jnp.asarray(rng.uniform(config.low, config.high, rows), jnp.float32),
         valid=jnp.ones(rows, bool),
+        proposed=jnp.zeros(rows, bool),
     )
     state = perception.begin(jax.random.key(seed), config)
     steps = partial(perception.train, state, clouds, samples, config, steps=config.steps_per_call)

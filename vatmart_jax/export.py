@@ -41,7 +41,7 @@ def _save_stablehlo(priors: Priors, folder: Path, n_proposals: int) -> None:
     n = priors.config.networks.pointnet.n_points
 
     def function(points: jax.Array, part_mask: jax.Array, task: jax.Array, seed: jax.Array) -> tuple[jax.Array, ...]:
-        return predict(priors.networks, priors.params, points, part_mask, task, jax.random.key(seed), n_proposals)
+        return predict(priors.ensemble, priors.params, points, part_mask, task, jax.random.key(seed), n_proposals)
 
     inputs = {
         "points": jax.ShapeDtypeStruct((n, 3), jnp.float32),

@@ -24,6 +24,7 @@ from flax import serialization
 from vatmart_jax.config import from_json, to_json
 from vatmart_jax.errors import UserError, at_least_one, first_line
 from vatmart_jax.files import whole, whole_folder, write_json
+from vatmart_jax.perception.ask import Ensemble
 from vatmart_jax.perception.networks import Features, Networks, NetworksConfig, Params
 from vatmart_jax.perception.pointnet2 import group
 
@@ -44,6 +45,8 @@ class PriorsConfig:
     """smallest amount they were trained on"""
     high: float
     """largest amount"""
+    copies: int = 1
+    """of a view, mirrored, turned and scaled, that the networks are asked about; 1: the view alone"""
     networks: NetworksConfig = field(default_factory=NetworksConfig)
 
 
@@ -70,8 +73,9 @@ class Priors:
     params: Params
 
     @property
-    def networks(self) -> Networks:
-        return Networks(self.config.networks)
+    def ensemble(self) -> Ensemble:
+        """The networks as they are to be asked."""
+        return Ensemble(Networks(self.config.networks), self.config.copies, self.config.task.endswith("drawer"))
 
     def save(self, path: Path | str) -> None:
         """Write the folder, complete or not at all; one that is there is replaced."""
@@ -124,16 +128,16 @@ class Priors:
         if mask.shape != (len(points),) or not mask.any():
             raise PriorsError(f"part_mask: expected {len(points)} booleans, one of them true at least")
         found = predict(
-            self.networks, self.params, points, mask, jnp.float32(task), jax.random.key(0) if key is None else key,
+            self.ensemble, self.params, points, mask, jnp.float32(task), jax.random.key(0) if key is None else key,
             n_proposals,
         )  # fmt: skip
         index, *rest = jax.device_get(found)
         return Prediction(int(index), points[int(index)], *rest)
 
 
-@partial(jax.jit, static_argnames=("networks", "n_proposals"))
+@partial(jax.jit, static_argnames=("ensemble", "n_proposals"))
 def predict(
-    networks: Networks,
+    ensemble: Ensemble,
     params: Params,
     points: jax.Array | np.ndarray,
     part_mask: jax.Array | np.ndarray,
@@ -145,19 +149,17 @@ def predict(
 
     Consumes the key.
     """
-    k_points, k_z = jax.random.split(key)
+    k_points, k_proposals = jax.random.split(key)
     points = jnp.asarray(points)
-    pointnet = networks.config.pointnet
+    pointnet = ensemble.networks.config.pointnet
     # Random order for the ball queries, and the number of points that training saw; a smaller cloud repeats.
     order = jax.random.permutation(k_points, len(points))
     seen = points[jnp.resize(order, (pointnet.n_points,))]
-    f = networks.features(params, seen, group(seen, points, pointnet))
-    actionability = jax.nn.sigmoid(networks.actionability(params, f, points, task))
+    f = ensemble.features(params, seen, group(seen, points, pointnet))
+    actionability = ensemble.actionability(params, f, points, task)
     contact = jnp.argmax(jnp.where(part_mask, actionability, -1))
-    at = Features(*(x[contact] for x in f))
-    z = jax.random.normal(k_z, (n_proposals, networks.config.latent_dim))
-    trajectories = networks.propose(params, at, points[contact], task, z)
-    scores = jax.nn.sigmoid(networks.score(params, at, points[contact], task, trajectories))
+    at = Features(*(x[:, contact] for x in f))
+    trajectories, scores = ensemble.propose(params, at, points[contact], task, k_proposals, n_proposals)
     best = jnp.argsort(-scores)
     return contact, actionability, trajectories[best], scores[best]
 

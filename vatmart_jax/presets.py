@@ -55,6 +55,8 @@ class EvaluationConfig:
     trials: int = 350
     """per split, as in the paper"""
     proposals: int = 100
+    copies: int = 8
+    """of a view that the trained networks are asked about, see `Ensemble`; goes into the priors' config"""
 
 
 @dataclass(frozen=True)
@@ -107,6 +109,7 @@ PRESETS = {
             samples=20_000, collect=160, scorer=16_000, proposal=35_000, actionability=5000, curiosity=1500,
             curiosity_iterations=1, curiosity_steps=1, finetune=0,
         ),
+        evaluation=EvaluationConfig(copies=1),
     ),
 }  # fmt: skip
 

@@ -58,7 +58,7 @@ def train(
     with Run(out, config) as run:
         training = Training(run, envs["train"], settings, config["seed"], report)
         progress = training.train()
-        described = PriorsConfig(task.name, task.low, task.high, training.config.networks)
+        described = PriorsConfig(task.name, task.low, task.high, settings.evaluation.copies, training.config.networks)
         priors = Priors(described, progress.perception.params)
         priors.save(out / "priors")
         write_bytes(out / "policy.msgpack", serialization.to_bytes(jax.device_get(progress.explore.td3.policy)))

@@ -21,7 +21,7 @@ from vatmart_jax.evaluation.priors import labelled, priors_metrics
 from vatmart_jax.expert import run_expert
 from vatmart_jax.files import write_json, write_text
 from vatmart_jax.inference import Priors
-from vatmart_jax.perception.train import clouds_of
+from vatmart_jax.perception.clouds import clouds_of
 from vatmart_jax.physics.interface import IMPLS
 from vatmart_jax.pipeline.collect import ProposalTrials
 from vatmart_jax.pipeline.explore import Explorer, start_pool
@@ -126,7 +126,7 @@ def evaluate_split(
     for name in methods:
         if name == "ours":
             clouds = clouds_of(env.views, priors.config.networks.pointnet)
-            trial = ProposalTrials(env, clouds, priors.networks, proposals)
+            trial = ProposalTrials(env, clouds, priors.ensemble, proposals)
             method = _ours(trial, priors)
         elif name == "expert":
             method = lambda start, key: (run_expert(env, start, key), None)  # noqa: E731
@@ -159,7 +159,7 @@ def _priors_split(
         return {"positives": 0}
     clouds = clouds_of(env.views, priors.config.networks.pointnet)
     result = priors_metrics(
-        priors.networks, priors.params, clouds, positive, negative, km, proposals=settings.evaluation.proposals
+        priors.ensemble, priors.params, clouds, positive, negative, km, proposals=settings.evaluation.proposals
     )
     report(f"label trajectories on {split}", 1, 1, {})
     return result

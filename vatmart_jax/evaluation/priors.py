@@ -9,8 +9,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from vatmart_jax.evaluation import metrics as m
-from vatmart_jax.perception.networks import Networks, Params
-from vatmart_jax.perception.train import Clouds, Samples, propose_trajectories, score_trajectories
+from vatmart_jax.perception.ask import Ensemble, propose_trajectories, score_trajectories
+from vatmart_jax.perception.clouds import Clouds
+from vatmart_jax.perception.networks import Params
+from vatmart_jax.perception.train import Samples
 from vatmart_jax.pipeline.collect import samples_of
 from vatmart_jax.pipeline.explore import Explorer
 
@@ -50,7 +52,7 @@ def labelled(explorer: Explorer, policy: Any, count: int, key: jax.Array) -> tup
 
 
 def priors_metrics(
-    networks: Networks,
+    ensemble: Ensemble,
     params: Params,
     clouds: Clouds,
     positive: Samples,
@@ -64,7 +66,7 @@ def priors_metrics(
     Coverage is the mean of `runs` draws of `proposals` trajectories per positive. Consumes the key.
     """
     score = lambda s: np.asarray(  # noqa: E731
-        score_trajectories(networks, params, clouds, s.view, s.contact, s.task, s.trajectory)
+        score_trajectories(ensemble, params, clouds, s.view, s.contact, s.task, s.trajectory)
     )
     p, n = score(positive), score(negative)
     labels = np.concatenate([np.ones(len(p)), np.zeros(len(n))])
@@ -73,7 +75,7 @@ def priors_metrics(
     covered = []
     for run in range(runs):
         proposed, _ = propose_trajectories(
-            networks, params, clouds, positive.view, positive.contact, positive.task,
+            ensemble, params, clouds, positive.view, positive.contact, positive.task,
             jax.random.fold_in(key, run), proposals,
         )  # fmt: skip
         covered.append(m.coverage(np.asarray(proposed), np.asarray(positive.trajectory)))

@@ -1,4 +1,4 @@
-"""Training the perception networks on samples of interaction, and asking them about views.
+"""Training the perception networks on samples of interaction.
 
 Clouds and samples stay on device. A step draws some views, some samples of each, and encodes each view once for all
 of its samples. Whole stretches of steps are one dispatch; nothing is compiled anew when samples come in.
@@ -6,6 +6,7 @@ of its samples. Whole stretches of steps are one dispatch; nothing is compiled a
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -13,33 +14,16 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 import optax
 from flax import struct
 
-from vatmart_jax.bank import ViewBank
-from vatmart_jax.errors import UserError
 from vatmart_jax.geometry import WAYPOINTS, carried
 from vatmart_jax.perception import losses
+from vatmart_jax.perception.ask import Ensemble
+from vatmart_jax.perception.clouds import Clouds
 from vatmart_jax.perception.networks import Features, Networks, NetworksConfig, Params, pack_course, places_and_turn
-from vatmart_jax.perception.pointnet2 import Grouping, PointNetConfig, group
-
-
-@struct.dataclass
-class Clouds:
-    """V views as the networks read them: N points each, the C contact candidates being the grouping's queries."""
-
-    points: jax.Array  # [V, N, 3] float16, object frame
-    grouping: Grouping
-    joints: tuple[jax.Array, jax.Array] | None = None  # [V, 3] axes and anchors, see Env.joints; labels, never inputs
-
-    @property
-    def contacts(self) -> jax.Array:
-        """[V, C, 3] float32, object frame."""
-        return self.grouping.queries
-
-    def __len__(self) -> int:
-        return len(self.points)
+from vatmart_jax.perception.pointnet2 import Grouping
+from vatmart_jax.perception.transform import Transform
 
 
 @struct.dataclass
@@ -52,6 +36,7 @@ class Samples:
     trajectory: jax.Array  # [M, 30] see geometry.pack_trajectory
     moved: jax.Array  # [M] how far the part moved in the task's sense, unit of `task`
     valid: jax.Array  # [M] bool, success was possible: free start, grasp made and kept, physics sound
+    proposed: jax.Array  # [M] bool, the networks proposed it; if not, it is the policy's or an expert's
 
     @classmethod
     def empty(cls, capacity: int) -> Samples:
@@ -59,7 +44,7 @@ class Samples:
         zeros = jnp.zeros(capacity)
         return cls(
             jnp.full(capacity, -1, jnp.int32), jnp.zeros(capacity, jnp.int32), zeros,
-            jnp.zeros((capacity, 6 + 6 * WAYPOINTS)), zeros, jnp.zeros(capacity, bool),
+            jnp.zeros((capacity, 6 + 6 * WAYPOINTS)), zeros, jnp.zeros(capacity, bool), jnp.zeros(capacity, bool),
         )  # fmt: skip
 
     def stored(self, new: Samples, at: jax.Array | int) -> Samples:
@@ -93,6 +78,8 @@ class PerceptionConfig:
     """trajectories proposed at a probe"""
     best: int = 5
     """the probe's actionability is the mean score of so many best proposals"""
+    proposed: float = 0.5
+    """share of a view's samples that are of the networks' own proposals, where it has both kinds"""
     hindsight: float = 0.5
     """share of the scorer's rows whose task is what the trajectory achieved, within the tolerance"""
     shifted: float = 0.3
@@ -160,11 +147,11 @@ actionability it rests, for it makes the targets.
 
 
 class Index(NamedTuple):
-    """Which rows of Samples belong to which view."""
+    """Which rows of Samples belong to which view, those of policy and expert apart from the networks' own."""
 
-    rows: jax.Array  # [M] int32, rows sorted by view, empty ones last
-    start: jax.Array  # [V] int32, where a view's rows begin
-    count: jax.Array  # [V] int32
+    rows: jax.Array  # [M] int32, rows sorted by view and kind, empty ones last
+    start: jax.Array  # [V, 2] int32, where a view's rows of either kind begin
+    count: jax.Array  # [V, 2] int32
     filled: jax.Array  # [V] int32, views with rows first
     n_filled: jax.Array  # [] int32
 
@@ -182,44 +169,6 @@ class Batch(NamedTuple):
     weight: jax.Array  # [V, Q] float, 1 where the cVAE learns from the row
     probe_task: jax.Array  # [V, R]
     joints: tuple[jax.Array, jax.Array] | None  # [V, 3] axes and anchors, where the networks have a course to learn
-
-
-class Selection(NamedTuple):
-    """What the networks would do in B views."""
-
-    contact: jax.Array  # [B] int32, index into the view's contacts
-    trajectory: jax.Array  # [B, 30]
-    score: jax.Array  # [B] probability
-    actionability: jax.Array  # [B, C] probability
-
-
-def points_of(bank: ViewBank, config: PointNetConfig) -> np.ndarray:
-    """The first n_points of every view. Raises UserError where the bank's views have fewer."""
-    if bank.points.shape[1] < config.n_points:
-        raise UserError(
-            f"the views have {bank.points.shape[1]} points, the networks want {config.n_points}; convert again with "
-            f"--points {config.n_points}, or choose another preset"
-        )
-    return bank.points[:, : config.n_points]
-
-
-def clouds_of(
-    bank: ViewBank, config: PointNetConfig, on_progress: Callable[[int, int], None] = lambda done, total: None
-) -> Clouds:
-    """The points that the networks see of every view, grouped; `on_progress(done, total)` counts views.
-
-    Raises UserError where the bank's views have too few.
-    """
-    points = points_of(bank, config)
-    total, size, parts = len(bank), 16, []
-    for start in range(0, total, size):
-        # The last batch is filled up with the last view: one shape, one compilation.
-        rows = np.minimum(np.arange(start, start + size), total - 1)
-        found = jax.device_get(_group(points[rows], bank.contacts[rows], config))
-        parts.append(found)
-        on_progress(min(start + size, total), total)
-    grouping = jax.tree.map(lambda *a: jnp.asarray(np.concatenate(a)[:total]), *parts)
-    return Clouds(jnp.asarray(points, jnp.float16), grouping)
 
 
 def begin(key: jax.Array, config: PerceptionConfig) -> PerceptionState:
@@ -259,132 +208,30 @@ def train(
     return replace(state, step=jnp.int32(0))
 
 
-@partial(jax.jit, static_argnames=("networks", "n_proposals"))
-def select_actions(
-    networks: Networks,
-    params: Params,
-    clouds: Clouds,
-    view: jax.Array,
-    task: jax.Array,
-    key: jax.Array,
-    n_proposals: int = 100,
-) -> Selection:
-    """The contact of highest actionability in each view [B], and its best-scored of n_proposals trajectories.
-
-    task: [B] > 0, rad or unit lengths. Consumes the key (paper, B: downstream manipulation).
-    """
-
-    def select(view: jax.Array, task: jax.Array, key: jax.Array) -> Selection:
-        contacts = clouds.contacts[view]
-        f = _encode(networks, params, clouds, view)
-        actionability = jax.nn.sigmoid(networks.actionability(params, f, contacts, task))
-        contact = jnp.argmax(actionability).astype(jnp.int32)
-        at = Features(*(x[contact] for x in f))
-        trajectory, score = _proposals(networks, params, at, contacts[contact], task, key, n_proposals)
-        best = jnp.argmax(score)
-        return Selection(contact, trajectory[best], score[best], actionability)
-
-    return _over_rows(select, view, task, jax.random.split(key, len(view)))
-
-
-@partial(jax.jit, static_argnames=("networks", "n_proposals"))
-def propose_trajectories(
-    networks: Networks,
-    params: Params,
-    clouds: Clouds,
-    view: jax.Array,
-    contact: jax.Array,
-    task: jax.Array,
-    key: jax.Array,
-    n_proposals: int = 100,
-) -> tuple[jax.Array, jax.Array]:
-    """Proposals [B, P, 30] and their scores [B, P] (probabilities) at given contacts [B] int. Consumes the key."""
-
-    def propose(view: jax.Array, contact: jax.Array, task: jax.Array, key: jax.Array) -> tuple[jax.Array, jax.Array]:
-        f = _encode(networks, params, clouds, view, contact)
-        return _proposals(networks, params, f, clouds.contacts[view, contact], task, key, n_proposals)
-
-    return _over_rows(propose, view, contact, task, jax.random.split(key, len(view)))
-
-
-@partial(jax.jit, static_argnames=("networks", "n_proposals"))
-def explore_actions(
-    networks: Networks,
-    params: Params,
-    clouds: Clouds,
-    view: jax.Array,
-    contact: jax.Array,
-    task: jax.Array,
-    key: jax.Array,
-    n_proposals: int = 100,
-) -> tuple[jax.Array, jax.Array]:
-    """What to try for views [V], T tasks in each [V, T]; one encoder pass per view serves all of them.
-
-    Of four tasks in a row, the first gets what `select_actions` would choose; the second the best proposal at a contact
-    drawn by actionability, the third at the given contact [V, T], and the last any proposal there. Returns contacts
-    [V, T] and trajectories [V, T, 30]. Consumes the key.
-    """
-
-    def explore(view: jax.Array, contact: jax.Array, task: jax.Array, key: jax.Array) -> tuple[jax.Array, jax.Array]:
-        k_contact, k_proposals, k_pick = jax.random.split(key, 3)
-        contacts = clouds.contacts[view]
-        f = _encode(networks, params, clouds, view)
-        logits = networks.actionability(params, f, contacts, task[:, None])  # [T, C]
-        kind = jnp.arange(len(task)) % 4
-        drawn = jax.random.categorical(k_contact, jax.nn.log_sigmoid(logits))
-        contact = jnp.select([kind == 0, kind == 1], [jnp.argmax(logits, -1), drawn], contact).astype(jnp.int32)
-        at = Features(*(x[contact][:, None] for x in f))
-        trajectory, score = _proposals(
-            networks, params, at, contacts[contact][:, None], task[:, None], k_proposals, n_proposals
-        )
-        pick = jnp.where(kind == 3, jax.random.randint(k_pick, kind.shape, 0, n_proposals), score.argmax(-1))
-        return contact, trajectory[jnp.arange(len(task)), pick]
-
-    return _over_rows(explore, view, contact, task, jax.random.split(key, len(view)))
-
-
-@partial(jax.jit, static_argnames=("networks",))
-def score_trajectories(
-    networks: Networks,
-    params: Params,
-    clouds: Clouds,
-    view: jax.Array,
-    contact: jax.Array,
-    task: jax.Array,
-    trajectory: jax.Array,
-) -> jax.Array:
-    """Probability [B] that trajectories [B, 30] from contacts [B] int do the tasks [B]."""
-
-    def score(view: jax.Array, contact: jax.Array, task: jax.Array, trajectory: jax.Array) -> jax.Array:
-        f = _encode(networks, params, clouds, view, contact)
-        return jax.nn.sigmoid(networks.score(params, f, clouds.contacts[view, contact], task, trajectory))
-
-    return _over_rows(score, view, contact, task, trajectory)
-
-
-@partial(jax.jit, static_argnames=("config",))
-def _group(points: jax.Array, queries: jax.Array, config: PointNetConfig) -> Grouping:
-    return jax.vmap(lambda p, q: group(p, q, config))(points, queries)
-
-
 @partial(jax.jit, static_argnames=("n_views",))
 def _index(samples: Samples, n_views: int) -> Index:
-    view = jnp.where(samples.view < 0, n_views, samples.view)
-    count = jnp.zeros(n_views + 1, jnp.int32).at[view].add(1)
+    place = jnp.where(samples.view < 0, 2 * n_views, 2 * samples.view + samples.proposed)
+    count = jnp.zeros(2 * n_views + 1, jnp.int32).at[place].add(1)
     start = jnp.cumsum(count) - count
-    count = count[:n_views]
-    return Index(
-        jnp.argsort(view).astype(jnp.int32), start[:n_views], count, jnp.argsort(count == 0), jnp.sum(count > 0)
-    )
+    start, count = (a[:-1].reshape(n_views, 2) for a in (start, count))
+    empty = count.sum(-1) == 0
+    return Index(jnp.argsort(place).astype(jnp.int32), start, count, jnp.argsort(empty), jnp.sum(~empty))
 
 
 def _draw(key: jax.Array, clouds: Clouds, samples: Samples, index: Index, config: PerceptionConfig) -> Batch:
-    """Views with samples, uniformly; samples of each, uniformly and with replacement. Consumes the key."""
-    k_view, k_row, k_task, k_probe, k_augment = jax.random.split(key, 5)
+    """Views with samples, uniformly, and samples of both kinds of each, uniformly and with replacement.
+
+    Consumes the key.
+    """
+    k_view, k_kind, k_row, k_task, k_probe, k_augment = jax.random.split(key, 6)
     shape = (config.views, config.queries)
     view = index.filled[jax.random.randint(k_view, (config.views,), 0, index.n_filled)]
-    offset = jnp.floor(jax.random.uniform(k_row, shape) * index.count[view][:, None]).astype(jnp.int32)
-    row = index.rows[index.start[view][:, None] + jnp.minimum(offset, index.count[view][:, None] - 1)]
+    count = index.count[view][:, None]
+    proposed = jax.random.bernoulli(k_kind, config.proposed, shape)
+    kind = jnp.where((count > 0).all(-1), proposed, count[..., 1] > 0).astype(jnp.int32)
+    count, start = (jnp.take_along_axis(a[view], kind, 1) for a in (index.count, index.start))
+    offset = jnp.floor(jax.random.uniform(k_row, shape) * count).astype(jnp.int32)
+    row = index.rows[start + jnp.minimum(offset, count - 1)]
     moved, valid, commanded = samples.moved[row], samples.valid[row], samples.task[row]
     achieved = valid & (moved >= config.low) & (moved <= config.high)
     task = jnp.where(achieved, _relabelled(k_task, moved, commanded, config), commanded)
@@ -428,52 +275,32 @@ def _relabelled(key: jax.Array, moved: jax.Array, commanded: jax.Array, config: 
     return jnp.where(kind < config.hindsight, near, jnp.where(kind < config.hindsight + config.shifted, off, commanded))
 
 
-# Left and right swapped: of a vector's xyz, and of an Euler residual, whose rotation R becomes S R S with
-# S = diag(1, -1, 1) in the gripper's own mirrored frame (the gripper is its own mirror image).
-_MIRROR = np.array([1, -1, 1], np.float32)
-_MIRROR_TRAJECTORY = np.concatenate([_MIRROR, _MIRROR, np.tile(np.concatenate([_MIRROR, -_MIRROR]), WAYPOINTS)])
-
-
 def _augmented(key: jax.Array, config: PerceptionConfig, batch: Batch) -> Batch:
-    """Whole scenes mirrored, turned about the vertical and scaled. Consumes the key.
-
-    Mirrored and turned scenes are exact; a scaled one takes the gripper's size along, which is small beside it.
-    """
+    """Every view by a random transform. Consumes the key."""
     k_mirror, k_yaw, k_scale = jax.random.split(key, 3)
     views = batch.points.shape[:1]
     mirrored = jax.random.bernoulli(k_mirror, 0.5, views) & config.mirror
     yaw = jax.random.uniform(k_yaw, views, minval=-config.yaw, maxval=config.yaw)
-    limit = float(np.log1p(config.scale))
+    limit = math.log1p(config.scale)
     scale = jnp.exp(jax.random.uniform(k_scale, views, minval=-limit, maxval=limit))
-    return jax.vmap(partial(transformed, task_is_length=config.task_is_length))(batch, mirrored, yaw, scale)
+    transform = Transform(mirrored, yaw, scale)
+    return jax.vmap(partial(transformed, task_is_length=config.task_is_length))(batch, transform)
 
 
-def transformed(
-    batch: Batch, mirrored: jax.Array, yaw: jax.Array, scale: jax.Array, task_is_length: bool = False
-) -> Batch:
-    """One view of a Batch, mirrored left to right where `mirrored` [] bool, then turned by `yaw` [] rad about z, then
-    `scale` [] times as large about the origin."""
-    cos, sin = jnp.cos(yaw), jnp.sin(yaw)
-    turn = jnp.array([[cos, sin, 0], [-sin, cos, 0], [0, 0, 1]])  # of row vectors
-    of_vectors = lambda v: jnp.where(mirrored, v * _MIRROR, v) @ turn  # noqa: E731
-    trajectory = jnp.where(mirrored, batch.trajectory * _MIRROR_TRAJECTORY, batch.trajectory)
-    triples = trajectory.reshape(-1, trajectory.shape[-1] // 3, 3)
-    number = jnp.arange(triples.shape[1])[:, None]  # two of the start rotation, then a move and Euler angles by turns
-    is_euler, is_move = (number >= 3) & (number % 2 == 1), (number >= 2) & (number % 2 == 0)
-    triples = jnp.where(is_euler, triples, triples @ turn) * jnp.where(is_move, scale, 1.0)
-    of_tasks = lambda t: t * scale if task_is_length else t  # noqa: E731
+def transformed(batch: Batch, transform: Transform, task_is_length: bool = False) -> Batch:
+    """One view of a Batch and all that belongs to it."""
     if batch.joints is not None:
-        axis, anchor = map(of_vectors, batch.joints)
+        axis, anchor = transform.directions(batch.joints[0]), transform.points(batch.joints[1])
         # The mirror image of a turn goes the other way about the mirrored axis.
-        axis = axis if task_is_length else jnp.where(mirrored, -axis, axis)
-        batch = batch._replace(joints=(axis, anchor * scale))
+        axis = axis if task_is_length else jnp.where(transform.mirrored, -axis, axis)
+        batch = batch._replace(joints=(axis, anchor))
     return batch._replace(
-        points=of_vectors(batch.points) * scale,
-        grouping=replace(batch.grouping, queries=of_vectors(batch.grouping.queries) * scale),
-        trajectory=triples.reshape(trajectory.shape),
-        task=of_tasks(batch.task),
-        achieved=of_tasks(batch.achieved),
-        probe_task=of_tasks(batch.probe_task),
+        points=transform.points(batch.points),
+        grouping=replace(batch.grouping, queries=transform.points(batch.grouping.queries)),
+        trajectory=transform.trajectory(batch.trajectory),
+        task=transform.task(batch.task, task_is_length),
+        achieved=transform.task(batch.achieved, task_is_length),
+        probe_task=transform.task(batch.probe_task, task_is_length),
     )
 
 
@@ -481,21 +308,21 @@ def _loss(
     params: Params, batch: Batch, key: jax.Array, config: PerceptionConfig, stage: str
 ) -> tuple[jax.Array, dict[str, jax.Array]]:
     """The weighted sum of a stage's losses, and each of them raw. Consumes the key."""
-    networks, heads = Networks(config.networks), STAGES[stage]
+    networks, heads = Networks(config.networks), _heads(config, stage)
     k_posterior, k_proposals = jax.random.split(key)
     f = jax.vmap(networks.features, (None, 0, 0, 0))(params, batch.points, batch.grouping, batch.which)
     contact = jnp.take_along_axis(batch.grouping.queries, batch.which[..., None], 1)
     n = batch.task.shape[1]
     of_samples, of_probes = Features(*(x[:, :n] for x in f)), Features(*(x[:, n:] for x in f))
     total, metrics = jnp.float32(0), {}
-    if "course" in heads and config.networks.course:
+    if "course" in heads:
         task = jnp.concatenate([batch.task, batch.probe_task], -1)
         truth = true_course(contact, *batch.joints, task, hinge=not config.task_is_length)  # pyright: ignore
-        found = networks.course(params, f, contact, task)
-        loss = jnp.abs(found - truth).mean()
-        off = (places_and_turn(found)[0] - places_and_turn(truth)[0])[..., -1, :]
+        off = networks.course(params, f, contact, task) - truth
+        loss = jnp.abs(off).mean()
         total += config.course_weight * loss
-        metrics |= {"course_loss": loss, "course_error": jnp.linalg.norm(off, axis=-1).mean()}
+        places, _ = places_and_turn(off)
+        metrics |= {"course_loss": loss, "course_error": jnp.linalg.norm(places[..., -1, :], axis=-1).mean()}
     if "scorer" in heads:
         logits = networks.score(params, of_samples, contact[:, :n], batch.task, batch.trajectory)
         loss = losses.score_loss(logits, batch.label)
@@ -515,8 +342,8 @@ def _loss(
     if "actionability" in heads:
         where = (contact[:, n:], batch.probe_task)
         logits = networks.actionability(params, of_probes, *where)
-        lifted = (Features(*(x[..., None, :] for x in of_probes)), where[0][..., None, :], where[1][..., None])
-        _, scores = _proposals(networks, params, *lifted, k_proposals, config.proposals)
+        itself = Features(*(x[None] for x in of_probes))
+        _, scores = Ensemble(networks).propose(params, itself, *where, k_proposals, config.proposals)
         target = jax.lax.stop_gradient(losses.actionability_target(scores, config.best))
         loss = losses.actionability_loss(logits, target)
         total += config.actionability_weight * loss
@@ -527,18 +354,21 @@ def _loss(
 def true_course(contact: jax.Array, axis: jax.Array, anchor: jax.Array, task: jax.Array, hinge: bool) -> jax.Array:
     """[V, Q, 15] what `Networks.course` should say of contacts [V, Q, 3] and tasks [V, Q] where the joints are axis
     and anchor [V, 3]."""
-    axis, anchor = axis[:, None], anchor[:, None]
+    contact, axis, anchor = contact[:, :, None], axis[:, None, None], anchor[:, None, None]
     quarters = jnp.arange(1, WAYPOINTS + 1) / WAYPOINTS
-    places = jnp.stack([carried(contact, axis, anchor, task * q, hinge) - contact for q in quarters], -2)
-    turn = axis * task[..., None] * (1.0 if hinge else 0.0)
-    return pack_course(places, turn)
+    places = carried(contact, axis, anchor, task[..., None] * quarters, hinge) - contact
+    turn = axis[:, 0] * task[..., None]
+    return pack_course(places, turn if hinge else jnp.zeros_like(turn))
+
+
+def _heads(config: PerceptionConfig, stage: str) -> tuple[str, ...]:
+    """The heads of a stage that these networks have."""
+    return tuple(head for head in STAGES[stage] if head != "course" or config.networks.course)
 
 
 def _trained(config: PerceptionConfig, stage: str) -> set[str]:
     """Names in the parameters of the networks that a stage trains."""
-    heads = STAGES[stage]
-    if not config.networks.course:
-        heads = tuple(head for head in heads if head != "course")
+    heads = _heads(config, stage)
     names = {name for head in heads for name in (("posterior", "decoder") if head == "proposal" else (head,))}
     if config.networks.separate or "course" in STAGES[stage]:
         names |= set(Networks(config.networks).encoders(*heads))
@@ -597,27 +427,3 @@ def _steps(
 
     zeros = jax.tree.map(lambda a: jnp.zeros(a.shape, a.dtype), jax.eval_shape(step, state)[1])
     return jax.lax.fori_loop(0, count, body, (state, zeros))
-
-
-def _encode(
-    networks: Networks, params: Params, clouds: Clouds, view: jax.Array, contact: jax.Array | None = None
-) -> Features:
-    """Features [C, F] of one view's contacts, or [F] of one of them."""
-    points, grouping = jax.tree.map(lambda a: a[view], (clouds.points, clouds.grouping))
-    if contact is None:
-        return networks.features(params, points, grouping)
-    return Features(*(x[0] for x in networks.features(params, points, grouping, contact[None])))
-
-
-def _proposals(
-    networks: Networks, params: Params, f: Features, contact: jax.Array, task: jax.Array, key: jax.Array, count: int
-) -> tuple[jax.Array, jax.Array]:
-    """Trajectories [..., count, 30] and probabilities of success; the rest broadcasts against [..., count]."""
-    z = jax.random.normal(key, (count, networks.config.latent_dim))
-    trajectory = networks.propose(params, f, contact, task, z)
-    return trajectory, jax.nn.sigmoid(networks.score(params, f, contact, task, trajectory))
-
-
-def _over_rows(function: Callable, *rows: jax.Array):
-    """function over the leading dimension, some rows at a time: a whole batch's groups would not fit into memory."""
-    return jax.lax.map(lambda row: function(*row), rows, batch_size=min(16, len(rows[0])))

@@ -9,12 +9,14 @@ import jax.numpy as jnp
 
 from vatmart_jax import geometry as g
 from vatmart_jax.env import Env, EnvState, Start
-from vatmart_jax.perception.networks import Networks, Params
-from vatmart_jax.perception.train import Clouds, Samples, explore_actions, select_actions
+from vatmart_jax.perception.ask import Ensemble, explore_actions, select_actions
+from vatmart_jax.perception.clouds import Clouds
+from vatmart_jax.perception.networks import Params
+from vatmart_jax.perception.train import Samples
 
 
 def samples_of(final: EnvState, trajectory: jax.Array | None = None) -> Samples:
-    """The samples [B] that finished trials make; `trajectory` [B, 30] where it is not what the state recorded."""
+    """The samples [B] that finished trials make; `trajectory` [B, 30] where the networks proposed it."""
     start = final.start
     return Samples(
         start.view,
@@ -23,6 +25,7 @@ def samples_of(final: EnvState, trajectory: jax.Array | None = None) -> Samples:
         final.trajectory if trajectory is None else trajectory,
         final.moved,
         final.valid & final.held,
+        jnp.full(start.view.shape, trajectory is not None),
     )
 
 
@@ -44,8 +47,8 @@ TASKS_PER_VIEW = 8
 class ProposalTrials:
     """Executes what the networks propose in an environment whose views are `clouds`."""
 
-    def __init__(self, env: Env, clouds: Clouds, networks: Networks, proposals: int):
-        self._env, self._clouds, self._networks, self._proposals = env, clouds, networks, proposals
+    def __init__(self, env: Env, clouds: Clouds, ensemble: Ensemble, proposals: int):
+        self._env, self._clouds, self._ensemble, self._proposals = env, clouds, ensemble, proposals
         self._execute = jax.jit(self._executed)
         self._sample_by_view = jax.jit(self._sampled_by_view)
 
@@ -64,7 +67,7 @@ class ProposalTrials:
 
         Consumes the key.
         """
-        chosen = select_actions(self._networks, params, self._clouds, start.view, start.task, key, self._proposals)
+        chosen = select_actions(self._ensemble, params, self._clouds, start.view, start.task, key, self._proposals)
         final = self._execute(replace(start, contact=chosen.contact), chosen.trajectory)
         return final, chosen.trajectory, chosen.score
 
@@ -77,7 +80,7 @@ class ProposalTrials:
         start = self._sample_by_view(ks)
         rows = (-1, TASKS_PER_VIEW)
         contact, trajectory = explore_actions(
-            self._networks, params, self._clouds, start.view.reshape(rows)[:, 0], start.contact.reshape(rows),
+            self._ensemble, params, self._clouds, start.view.reshape(rows)[:, 0], start.contact.reshape(rows),
             start.task.reshape(rows), ke, self._proposals,
         )  # fmt: skip
         trajectory = trajectory.reshape(len(start.view), -1)

@@ -16,8 +16,10 @@ from flax import struct
 from vatmart_jax.bank import SLIDE
 from vatmart_jax.env import Env, Start, Task
 from vatmart_jax.perception import train as perception
+from vatmart_jax.perception.ask import Ensemble, score_trajectories
+from vatmart_jax.perception.clouds import Clouds, clouds_of, points_of
 from vatmart_jax.perception.networks import Networks
-from vatmart_jax.perception.train import Clouds, PerceptionConfig, PerceptionState, Samples
+from vatmart_jax.perception.train import PerceptionConfig, PerceptionState, Samples
 from vatmart_jax.pipeline.collect import ProposalTrials, curious, samples_of
 from vatmart_jax.pipeline.explore import Explorer, ExploreState, start_pool
 from vatmart_jax.pipeline.run import Run
@@ -53,13 +55,13 @@ class Training:
         self._run, self._env, self._settings, self._report = run, env, settings, report
         self._seed = jax.random.key(seed)
         self.config = perception_config(settings, env.task)
-        self.networks = Networks(self.config.networks)
+        self._ensemble = Ensemble(Networks(self.config.networks))
         self._explorer = Explorer(env, settings.explore)
         self._pool: Start | None = None
         self._clouds: Clouds | None = None
-        self._score = partial(perception.score_trajectories, self.networks)
+        self._score = partial(score_trajectories, self._ensemble)
         self._begun = time.monotonic()
-        perception.points_of(env.views, self.config.networks.pointnet)  # too few: said before hours of exploration
+        points_of(env.views, self.config.networks.pointnet)  # too few: said before hours of exploration
 
     def key(self, purpose: str, index: int | jax.Array = 0) -> jax.Array:
         """A key for one use, the same whenever the run is resumed."""
@@ -93,7 +95,7 @@ class Training:
     def clouds(self) -> Clouds:
         """The environment's views as the networks read them."""
         if self._clouds is None:
-            clouds = perception.clouds_of(
+            clouds = clouds_of(
                 self._env.views,
                 self.config.networks.pointnet,
                 lambda done, total: self._report("group views", done, total, {}),
@@ -195,7 +197,7 @@ class Training:
         for done in range(int(progress.done), schedule.curiosity):
             params = progress.perception.params
             penalty = jax.tree_util.Partial(
-                partial(_curiosity_penalty, self.networks), params, self.clouds(), schedule.curiosity_weight
+                partial(_curiosity_penalty, self._ensemble), params, self.clouds(), schedule.curiosity_weight
             )
             metrics: dict[str, Any] = {}
             for _ in range(schedule.curiosity_iterations):
@@ -214,7 +216,7 @@ class Training:
         schedule = self._settings.schedule
         if schedule.finetune == 0:
             return progress
-        trials = ProposalTrials(self._env, self.clouds(), self.networks, self.config.proposals)
+        trials = ProposalTrials(self._env, self.clouds(), self._ensemble, self.config.proposals)
         for done in range(int(progress.done), schedule.finetune):
             rates = []
             for batch in range(schedule.finetune_batches):
@@ -244,12 +246,10 @@ def hash_of(text: str) -> int:
     return value
 
 
-def _curiosity_penalty(networks: Networks, params: Any, clouds: Clouds, weight: jax.Array, final) -> jax.Array:
+def _curiosity_penalty(ensemble: Ensemble, params: Any, clouds: Clouds, weight: jax.Array, final) -> jax.Array:
     """[B] the paper's curiosity reward with its sign turned: weight times the scorer's confidence."""
     start = final.start
-    score = perception.score_trajectories(
-        networks, params, clouds, start.view, start.contact, start.task, final.trajectory
-    )
+    score = score_trajectories(ensemble, params, clouds, start.view, start.contact, start.task, final.trajectory)
     return weight * score
 
 
