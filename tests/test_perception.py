@@ -15,7 +15,14 @@ from vatmart_jax.perception import losses
 from vatmart_jax.perception import train as t
 from vatmart_jax.perception.ask import Ensemble, propose_trajectories, score_trajectories, select_actions
 from vatmart_jax.perception.clouds import Clouds
-from vatmart_jax.perception.networks import DenseOfParts, Features, Networks, NetworksConfig, places_and_turn
+from vatmart_jax.perception.networks import (
+    DenseOfParts,
+    Features,
+    Networks,
+    NetworksConfig,
+    pack_course,
+    places_and_turn,
+)
 from vatmart_jax.perception.pointnet2 import Level, PointNetConfig
 from vatmart_jax.perception.transform import Transform, spread
 from vatmart_jax.presets import PRESETS
@@ -252,6 +259,17 @@ def test_an_ensemble_says_the_mean_over_copies_and_proposes_in_all_of_them(world
         lifted = Features(*(x[:, None] for x in of_copy)), asked[0][:, None], asked[1][:, None]
         mine = proposed[:, 3 * copy : 3 * copy + 3]
         close(one.trajectory(mine), networks.propose(params, *lifted, z[copy, : mine.shape[1]]))
+
+
+def test_disturbed_courses_are_off_by_the_share_asked_for() -> None:
+    places = jnp.array([[0.1, 0, 0], [0.2, 0, 0], [0.3, 0, 0], [0.4, 0, 0]])
+    course = jnp.broadcast_to(pack_course(places, jnp.array([0.0, 0, 0.5])), (8, 500, 15))
+    found, turn = places_and_turn(t._disturbed(jax.random.key(0), course, 0.1))
+    off = jnp.sqrt(((found - places) ** 2).mean((0, 1))) / jnp.array([0.1, 0.2, 0.3, 0.4])[:, None]
+    np.testing.assert_allclose(off[:, 1:], 0.1, rtol=0.1)
+    np.testing.assert_allclose(off[:, 0], 0.1 * np.sqrt(2), rtol=0.1)
+    np.testing.assert_allclose(jnp.std(turn, (0, 1)), 0.05, rtol=0.1)
+    np.testing.assert_allclose(t._disturbed(jax.random.key(0), course, 0.0), course, rtol=1e-6)
 
 
 def test_a_course_can_be_learned_and_is_asked_for_labels(world, data) -> None:

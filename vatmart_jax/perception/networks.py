@@ -129,10 +129,19 @@ class Networks:
         return Features(*(found if self.config.separate else found * 3))  # pyright: ignore[reportArgumentType]
 
     def score(
-        self, params: Params, f: Features, contact: jax.Array, task: jax.Array, trajectory: jax.Array
+        self,
+        params: Params,
+        f: Features,
+        contact: jax.Array,
+        task: jax.Array,
+        trajectory: jax.Array,
+        course: jax.Array | None = None,
     ) -> jax.Array:
-        """Logit [...] that the trajectory does the task; trajectories as `geometry.pack_trajectory` makes them."""
-        at = self._at(params, f, f.scorer, contact, task)
+        """Logit [...] that the trajectory does the task; trajectories as `geometry.pack_trajectory` makes them.
+
+        course: [..., 15], read in place of what the networks themselves say of it.
+        """
+        at = self._at(params, f, f.scorer, contact, task, course)
         return self._scorer.apply({"params": params["scorer"]}, trajectory, *at)[..., 0]  # pyright: ignore
 
     def posterior(
@@ -170,12 +179,19 @@ class Networks:
         return self._course.apply({"params": params["course"]}, f.scorer, contact, task)  # pyright: ignore
 
     def _at(
-        self, params: Params, f: Features, own: jax.Array, contact: jax.Array, task: jax.Array
+        self,
+        params: Params,
+        f: Features,
+        own: jax.Array,
+        contact: jax.Array,
+        task: jax.Array,
+        course: jax.Array | None = None,
     ) -> tuple[jax.Array, ...]:
         """What every head reads: its own feature, contact, task and, where there is a head for it, the course."""
         if not self.config.course:
             return own, contact, task
-        return own, contact, task, jax.lax.stop_gradient(self.course(params, f, contact, task))
+        course = self.course(params, f, contact, task) if course is None else course
+        return own, contact, task, jax.lax.stop_gradient(course)
 
     @property
     def _scorer(self) -> TrajectoryHead:

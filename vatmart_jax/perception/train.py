@@ -108,10 +108,12 @@ class PerceptionConfig:
     """of the squared 6D distance of start rotations"""
     kl_weight: float = 1.0
     """of the KL divergence; at 0.05 the decoder's samples ignore contact and task"""
-    kl_free: float = 3.0
+    kl_free: float = 6.0
     """nats of it that cost nothing, so that the posterior does not collapse before the decoder has learned to listen"""
     course_weight: float = 50.0
     """of the L1 of the touched point's course"""
+    course_noise: float = 0.15
+    """the scorer learns with courses off by about this share, as they are on objects that it has not seen"""
     actionability_weight: float = 5.0
     """of the L1 of actionability"""
     steps_per_call: int = 50
@@ -309,22 +311,24 @@ def _loss(
 ) -> tuple[jax.Array, dict[str, jax.Array]]:
     """The weighted sum of a stage's losses, and each of them raw. Consumes the key."""
     networks, heads = Networks(config.networks), _heads(config, stage)
-    k_posterior, k_proposals = jax.random.split(key)
+    k_posterior, k_proposals, k_course = jax.random.split(key, 3)
     f = jax.vmap(networks.features, (None, 0, 0, 0))(params, batch.points, batch.grouping, batch.which)
     contact = jnp.take_along_axis(batch.grouping.queries, batch.which[..., None], 1)
     n = batch.task.shape[1]
     of_samples, of_probes = Features(*(x[:, :n] for x in f)), Features(*(x[:, n:] for x in f))
-    total, metrics = jnp.float32(0), {}
+    total, metrics, course = jnp.float32(0), {}, None
     if "course" in heads:
         task = jnp.concatenate([batch.task, batch.probe_task], -1)
         truth = true_course(contact, *batch.joints, task, hinge=not config.task_is_length)  # pyright: ignore
-        off = networks.course(params, f, contact, task) - truth
+        said = networks.course(params, f, contact, task)
+        course = _disturbed(k_course, said[:, :n], config.course_noise)
+        off = said - truth
         loss = jnp.abs(off).mean()
         total += config.course_weight * loss
         places, _ = places_and_turn(off)
         metrics |= {"course_loss": loss, "course_error": jnp.linalg.norm(places[..., -1, :], axis=-1).mean()}
     if "scorer" in heads:
-        logits = networks.score(params, of_samples, contact[:, :n], batch.task, batch.trajectory)
+        logits = networks.score(params, of_samples, contact[:, :n], batch.task, batch.trajectory, course)
         loss = losses.score_loss(logits, batch.label)
         total += config.score_weight * loss
         accuracy = jnp.mean((logits > 0) == (batch.label > 0.5))
@@ -359,6 +363,18 @@ def true_course(contact: jax.Array, axis: jax.Array, anchor: jax.Array, task: ja
     places = carried(contact, axis, anchor, task[..., None] * quarters, hinge) - contact
     turn = axis[:, 0] * task[..., None]
     return pack_course(places, turn if hinge else jnp.zeros_like(turn))
+
+
+def _disturbed(key: jax.Array, course: jax.Array, share: float) -> jax.Array:
+    """Courses [V, Q, 15] longer or shorter, bent aside and turned otherwise by about `share`. Consumes the key."""
+    k_length, k_side, k_turn = jax.random.split(key, 3)
+    places, turn = places_and_turn(course)
+    length = jnp.linalg.norm(places[..., -1:, :], axis=-1, keepdims=True)
+    aside = jnp.arange(1, WAYPOINTS + 1)[:, None] / WAYPOINTS * length
+    normal = lambda key, of: jax.random.normal(key, of.shape)  # noqa: E731
+    places = places * jnp.exp(share * normal(k_length, length)) + share * aside * normal(k_side, places[..., :1, :])
+    turn = turn + share * jnp.linalg.norm(turn, axis=-1, keepdims=True) * normal(k_turn, turn)
+    return pack_course(places, turn)
 
 
 def _heads(config: PerceptionConfig, stage: str) -> tuple[str, ...]:
