@@ -88,7 +88,7 @@ def main(args: Study) -> None:
                 )  # fmt: skip
                 progress = training.train(begun)
             described_priors = PriorsConfig(
-                task.name, task.low, task.high, own.evaluation.copies, training.config.networks
+                task.name, task.low, task.high, training.config.networks, own.evaluation.copies
             )
             priors = Priors(described_priors, progress.perception.params)
             rows = []

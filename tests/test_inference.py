@@ -105,6 +105,8 @@ def damage(folder: Path, how: str) -> None:
         config.write_text("[1, 2]")
     elif how == "unknown field":
         config.write_text(json.dumps(json.loads(config.read_text()) | {"colour": 1}))
+    elif how == "too many copies":
+        config.write_text(json.dumps(json.loads(config.read_text()) | {"copies": 10**9}))
     elif how == "other sizes":
         text = json.loads(config.read_text())
         text["networks"]["latent_dim"] = 7
@@ -129,6 +131,7 @@ def damage(folder: Path, how: str) -> None:
         ("config not JSON", "config.json: not a config of priors"),
         ("config of something else", "config.json: not a config of priors"),
         ("unknown field", "colour"),
+        ("too many copies", r"config.json: not a config of priors \(copies 1000000000: expected 1 to 64"),
         ("other sizes", r"params.msgpack: parameter \['decoder'\].*expected float32"),
         ("missing network", "parameter .*decoder.* is missing"),
         ("not finite", "parameter .*scorer.* is not finite"),

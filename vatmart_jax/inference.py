@@ -29,6 +29,7 @@ from vatmart_jax.perception.networks import Features, Networks, NetworksConfig, 
 from vatmart_jax.perception.pointnet2 import group
 
 FORMAT = 1
+MOST_COPIES = 64  # of a view: a config is untrusted, and memory grows with them
 
 
 class PriorsError(UserError):
@@ -45,9 +46,13 @@ class PriorsConfig:
     """smallest amount they were trained on"""
     high: float
     """largest amount"""
-    copies: int = 1
-    """of a view, mirrored, turned and scaled, that the networks are asked about; 1: the view alone"""
     networks: NetworksConfig = field(default_factory=NetworksConfig)
+    copies: int = 1
+    """of a view, mirrored and turned, that the networks are asked about; 1: the view alone"""
+
+    def __post_init__(self) -> None:
+        if not 1 <= self.copies <= MOST_COPIES:
+            raise UserError(f"copies {self.copies}: expected 1 to {MOST_COPIES}")
 
 
 class Prediction(NamedTuple):

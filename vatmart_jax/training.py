@@ -57,8 +57,8 @@ def train(
     envs = environments(data, task, config["impl"], settings)
     with Run(out, config) as run:
         training = Training(run, envs["train"], settings, config["seed"], report)
+        described = PriorsConfig(task.name, task.low, task.high, training.config.networks, settings.evaluation.copies)
         progress = training.train()
-        described = PriorsConfig(task.name, task.low, task.high, settings.evaluation.copies, training.config.networks)
         priors = Priors(described, progress.perception.params)
         priors.save(out / "priors")
         write_bytes(out / "policy.msgpack", serialization.to_bytes(jax.device_get(progress.explore.td3.policy)))
