@@ -80,7 +80,7 @@ class Priors:
     @property
     def ensemble(self) -> Ensemble:
         """The networks as they are to be asked."""
-        return Ensemble(Networks(self.config.networks), self.config.copies, self.config.task.endswith("drawer"))
+        return Ensemble(Networks(self.config.networks), self.config.copies)
 
     def save(self, path: Path | str) -> None:
         """Write the folder, complete or not at all; one that is there is replaced."""

@@ -29,14 +29,9 @@ def random_method(env: Env) -> Method:
 
     @jax.jit
     def run(start: Start, key: jax.Array) -> tuple[EnvState, None]:
-        kc, kr, kn, ka = jax.random.split(key, 4)
-        n = len(start.view)
-        contact = jax.random.randint(kc, (n,), 0, env.views.contacts.shape[1])
-        normal = jnp.asarray(env.views.contact_normals)[start.view, contact]
-        up = g.cone_direction(ka, -normal, env.config.cone)
-        rotation = g.gripper_frame(up, jax.random.normal(kn, up.shape))
-        residuals = jax.random.uniform(kr, (n, g.WAYPOINTS, 6), minval=-1.0) * limits
-        return env.execute(start.replace(contact=contact, rotation=rotation), residuals), None
+        k_start, k_move = jax.random.split(key)
+        residuals = jax.random.uniform(k_move, (len(start.view), g.WAYPOINTS, 6), minval=-1.0) * limits
+        return env.execute(env.approach(k_start, start.view, start.task, 0.0), residuals), None
 
     return run
 

@@ -1,7 +1,6 @@
 """What trained networks say of views: where to act, how, and how likely that is to do the task.
 
-An `Ensemble` asks them about a view and about mirrored, turned and scaled copies of it. The scores it gives are means
-over the copies, its proposals come from all of them.
+An `Ensemble` asks them about a view and about mirrored and turned copies of it; the scores it gives are means.
 """
 
 from __future__ import annotations
@@ -24,14 +23,12 @@ from vatmart_jax.perception.transform import Transform, spread
 class Ensemble:
     """The networks, asked about `copies` of a view (1: the view alone).
 
-    Heads broadcast as those of `Networks` do, with features that carry a leading dimension for the copies; contacts,
-    tasks and trajectories are those of the view as it is.
+    Heads broadcast as those of `Networks` do, with features that carry a leading dimension for the copies; contacts
+    and trajectories are those of the view as it is.
     """
 
     networks: Networks
     copies: int = 1
-    task_is_length: bool = False
-    """drawers: tasks grow with a copy"""
 
     def features(
         self, params: Params, points: jax.Array, grouping: Grouping, which: jax.Array | None = None
@@ -46,30 +43,8 @@ class Ensemble:
 
     def actionability(self, params: Params, f: Features, contact: jax.Array, task: jax.Array) -> jax.Array:
         """Actionability [...] as a probability."""
-
-        def of_copy(transform: Transform, f: Features) -> jax.Array:
-            asked = transform.points(contact), transform.task(task, self.task_is_length)
-            return jax.nn.sigmoid(self.networks.actionability(params, f, *asked))
-
+        of_copy = lambda t, f: jax.nn.sigmoid(self.networks.actionability(params, f, t.points(contact), task))  # noqa: E731
         return jax.vmap(of_copy)(spread(self.copies), f).mean(0)
-
-    def propose(
-        self, params: Params, f: Features, contact: jax.Array, task: jax.Array, key: jax.Array, count: int
-    ) -> tuple[jax.Array, jax.Array]:
-        """Trajectories [..., count, 30], as many of every copy as of the next, and their scores [..., count].
-
-        Contacts [..., 3] and tasks [...]. Consumes the key.
-        """
-        lifted = Features(*(x[..., None, :] for x in f)), contact[..., None, :], task[..., None]
-        z = jax.random.normal(key, (self.copies, -(-count // self.copies), self.networks.config.latent_dim))
-
-        def of_copy(transform: Transform, f: Features, z: jax.Array) -> jax.Array:
-            asked = transform.points(lifted[1]), transform.task(lifted[2], self.task_is_length)
-            return transform.inverse.trajectory(self.networks.propose(params, f, *asked, z))
-
-        proposed = jax.vmap(of_copy, out_axes=-3)(spread(self.copies), lifted[0], z)
-        proposed = proposed.reshape(*proposed.shape[:-3], -1, proposed.shape[-1])[..., :count, :]
-        return proposed, self.score(params, *lifted, proposed)
 
     def score(
         self, params: Params, f: Features, contact: jax.Array, task: jax.Array, trajectory: jax.Array
@@ -77,10 +52,24 @@ class Ensemble:
         """Probability [...] that the trajectory does the task."""
 
         def of_copy(transform: Transform, f: Features) -> jax.Array:
-            asked = transform.points(contact), transform.task(task, self.task_is_length)
-            return jax.nn.sigmoid(self.networks.score(params, f, *asked, transform.trajectory(trajectory)))
+            asked = transform.points(contact), task, transform.trajectory(trajectory)
+            return jax.nn.sigmoid(self.networks.score(params, f, *asked))
 
         return jax.vmap(of_copy)(spread(self.copies), f).mean(0)
+
+    def propose(
+        self, params: Params, f: Features, contact: jax.Array, task: jax.Array, key: jax.Array, count: int
+    ) -> tuple[jax.Array, jax.Array]:
+        """Trajectories [..., count, 30] for the view as it is, and their scores [..., count].
+
+        Contacts [..., 3] and tasks [...]. Those made for the copies and brought back succeed less (docs/learning.md).
+        Consumes the key.
+        """
+        lifted = Features(*(x[..., None, :] for x in f)), contact[..., None, :], task[..., None]
+        z = jax.random.normal(key, (count, self.networks.config.latent_dim))
+        itself = Features(*(x[0] for x in lifted[0]))
+        proposed = self.networks.propose(params, itself, *lifted[1:], z)
+        return proposed, self.score(params, *lifted, proposed)
 
 
 class Selection(NamedTuple):

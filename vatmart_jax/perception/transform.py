@@ -60,10 +60,9 @@ class Transform(NamedTuple):
         return jnp.array([[cos, sin, zero], [-sin, cos, zero], [zero, zero, zero + 1]])  # of row vectors
 
 
-def spread(count: int, yaw: float = 0.2, scale: float = 1.13) -> Transform:
-    """`count` transforms [count] to ask the networks about, within what training augments with: the scene as it is
-    first, then mirrored by turns, with yaw and scale spread over their ranges."""
+def spread(count: int, yaw: float = 0.2) -> Transform:
+    """`count` exact transforms [count] to ask the networks about: the scene as it is, then mirrored by turns, turned
+    by up to `yaw` (rad), which training augments with too."""
     number = np.arange(count)
-    turned = yaw * np.where(number == 0, 0.0, np.sin(2.4 * number))  # 2.4 rad: no two of a few are alike
-    grown = scale ** np.where(number == 0, 0.0, np.cos(2.4 * number))
-    return Transform(jnp.asarray(number % 2 == 1), jnp.asarray(turned, jnp.float32), jnp.asarray(grown, jnp.float32))
+    turned = yaw * np.sin(2.4 * number)  # 2.4 rad: no two of a few are alike
+    return Transform(jnp.asarray(number % 2 == 1), jnp.asarray(turned, jnp.float32), jnp.ones(count))
