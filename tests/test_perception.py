@@ -238,15 +238,15 @@ def test_an_ensemble_says_the_mean_over_copies_of_what_it_proposes_for_the_view(
     params, ensemble = t.begin(jax.random.key(0), COURSE).params, Ensemble(networks, 3)
     points, grouping = jax.tree.map(lambda a: a[0], (clouds.points, clouds.grouping))
     contact, task, which = clouds.contacts[0, :4], jnp.linspace(0.1, 0.4, 4), jnp.arange(4)
-    scores, actionabilities = [], []
+    scores, actionabilities, features = [], [], jax.jit(networks.features)
     for copy in range(3):
         one = jax.tree.map(lambda a: a[copy], spread(3))  # noqa: B023
         copied = grouping.replace(queries=one.points(grouping.queries))
-        f = networks.features(params, one.points(points), copied, which)
+        f = features(params, one.points(points), copied, which)
         asked = one.points(contact), task
         scores.append(jax.nn.sigmoid(networks.score(params, f, *asked, one.trajectory(data.trajectory[:4]))))
         actionabilities.append(jax.nn.sigmoid(networks.actionability(params, f, *asked)))
-    f = ensemble.features(params, points, grouping, which)
+    f = jax.jit(ensemble.features)(params, points, grouping, which)
     close = partial(np.testing.assert_allclose, rtol=2e-3, atol=2e-4)
     close(ensemble.score(params, f, contact, task, data.trajectory[:4]), sum(scores) / 3)
     close(ensemble.actionability(params, f, contact, task), sum(actionabilities) / 3)

@@ -37,7 +37,7 @@ TINY = Settings(
         samples=512, collect=2, course=3, scorer=6, proposal=6, actionability=3, curiosity=2, curiosity_iterations=1,
         curiosity_steps=3, finetune=1, finetune_batches=1, finetune_steps=3,
     ),
-    evaluation=EvaluationConfig(trials=24, proposals=4),
+    evaluation=EvaluationConfig(trials=24, proposals=4, copies=2),
 )  # fmt: skip
 
 
