@@ -15,11 +15,11 @@ from typing import Any
 
 import tyro
 
-from vatmart_jax.errors import UserError
+from vatmart_jax.errors import UserError, at_least_one, one_of
 from vatmart_jax.evaluation.metrics import wilson_interval
 from vatmart_jax.files import write_json
 from vatmart_jax.physics.interface import default_impl
-from vatmart_jax.pipeline.run import read_config
+from vatmart_jax.pipeline.run import read_config, read_metrics
 from vatmart_jax.presets import PRESETS
 from vatmart_jax.progress import Bars
 from vatmart_jax.training import resolve, train
@@ -52,6 +52,8 @@ def run(args: Curiosity, seed: int, weight: float, out: Path, bars: Bars) -> dic
 
 
 def main(args: Curiosity) -> None:
+    one_of("--preset", args.preset, PRESETS)
+    at_least_one("--seeds: their number", len(args.seeds))
     weight = PRESETS[args.preset].schedule.curiosity_weight
     names = {f"{seed}-{'on' if on else 'off'}": (seed, on) for seed in args.seeds for on in (True, False)}
     names[f"{args.seeds[0]}-on-again"] = (args.seeds[0], True)
@@ -60,8 +62,7 @@ def main(args: Curiosity) -> None:
         for name, (seed, on) in names.items():
             result = run(args, seed, weight if on else 0.0, args.runs / name, bars)
             ours = {row["split"]: row for row in result["results"] if row["method"] == "ours"}
-            lines = [json.loads(line) for line in (args.runs / name / "metrics.jsonl").read_text().splitlines()]
-            novel = [line["novel"] for line in lines if line["stage"] == "curiosity"]
+            novel = [line["novel"] for line in read_metrics(args.runs / name) if line["stage"] == "curiosity"]
             rows.append({
                 "run": name, "seed": seed, "curiosity": on, "seconds": result["seconds"], "novel": novel,
                 **{split: {k: row[k] for k in ("success", "ci95", "said", "trials")} for split, row in ours.items()},

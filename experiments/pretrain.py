@@ -13,7 +13,7 @@ import tyro
 from vatmart_jax import pretrained
 from vatmart_jax.files import whole_folder, write_json
 from vatmart_jax.inference import Priors
-from vatmart_jax.pipeline.run import read_config
+from vatmart_jax.pipeline.run import read_config, read_metrics
 
 RESULTS = Path(__file__).parent / "results"
 
@@ -35,7 +35,7 @@ def main(args: Pretrain) -> None:
         priors.save(folder / "priors")
         shutil.copyfile(args.run / "policy.msgpack", folder / "policy.msgpack")
     result = json.loads((args.run / "result.json").read_text()) | {"run": args.name}
-    lines = [json.loads(line) for line in (args.run / "metrics.jsonl").read_text().splitlines()]
+    lines = read_metrics(args.run)
     for stage in ("explore", "finetune"):
         result[f"{stage}_success"] = [round(line["success"], 3) for line in lines if line["stage"] == stage]
     write_json(RESULTS / f"train-{args.name}.json", result)

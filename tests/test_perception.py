@@ -223,16 +223,6 @@ def test_the_course_of_a_mirrored_turned_and_scaled_scene_is_that_of_the_scene(w
             )
 
 
-@pytest.mark.parametrize("mirrored", [False, True])
-def test_an_inverse_transform_undoes_it(data, mirrored: bool) -> None:
-    there, back = transform(mirrored), transform(mirrored).inverse
-    points = jax.random.normal(jax.random.key(0), (5, 3))
-    np.testing.assert_allclose(back.points(there.points(points)), points, atol=1e-5)
-    again = back.trajectory(there.trajectory(data.trajectory))
-    np.testing.assert_allclose(again, data.trajectory, atol=1e-5)
-    assert float(back.task(there.task(jnp.float32(0.3), True), True)) == pytest.approx(0.3)
-
-
 def test_an_ensemble_says_the_mean_over_copies_of_what_it_proposes_for_the_view(world, data) -> None:
     clouds, networks = world[0], Networks(COURSE.networks)
     params, ensemble = t.begin(jax.random.key(0), COURSE).params, Ensemble(networks, 3)

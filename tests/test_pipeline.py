@@ -17,7 +17,7 @@ from vatmart_jax.perception.pointnet2 import Level, PointNetConfig
 from vatmart_jax.perception.train import PerceptionConfig
 from vatmart_jax.physics import PhysicsConfig
 from vatmart_jax.pipeline.explore import ExploreConfig
-from vatmart_jax.pipeline.run import Run, RunError
+from vatmart_jax.pipeline.run import Run, RunError, read_metrics
 from vatmart_jax.presets import PRESETS, EvaluationConfig, Schedule, Settings, default_preset
 from vatmart_jax.rl.td3 import TD3Config
 from vatmart_jax.training import resolve, train
@@ -69,7 +69,7 @@ def test_a_run_leaves_everything_its_readers_need(finished):
     assert not list(out.rglob("*.part"))
     assert set(result["success"]) == {"test_shapes", "test_categories"}
     assert {row["method"] for row in result["results"]} == {"ours", "random"}
-    stages = [json.loads(line)["stage"] for line in (out / "metrics.jsonl").read_text().splitlines()]
+    stages = [line["stage"] for line in read_metrics(out)]
     assert list(dict.fromkeys(stages)) == [
         "explore", "collect", "course", "scorer", "proposal", "actionability", "curiosity", "finetune",
     ]  # fmt: skip
@@ -122,8 +122,8 @@ def test_a_run_killed_at_any_stage_resumes_to_the_same_result(finished, converte
     whole, result = finished
     assert resumed["results"] == result["results"]
     metrics = [
-        [{k: v for k, v in json.loads(line).items() if k != "seconds"} for line in path.read_text().splitlines()]
-        for path in (whole / "metrics.jsonl", tmp_path / "run" / "metrics.jsonl")
+        [{k: v for k, v in line.items() if k != "seconds"} for line in read_metrics(folder)]
+        for folder in (whole, tmp_path / "run")
     ]
     assert metrics[0] == metrics[1]
 
@@ -167,6 +167,14 @@ def test_unknown_names_are_refused_by_name():
         resolve("push-lid", "quick", "c", 0, TINY, None)
     with pytest.raises(UserError, match="--impl x"):
         resolve("push-door", "quick", "x", 0, TINY, None)
+
+
+def test_a_number_of_copies_that_cannot_be_is_refused_before_anything_is_written(converted, tmp_path):
+    settings = replace(TINY, evaluation=EvaluationConfig(copies=0))
+    config = resolve("push-drawer", "quick", "c", 0, settings, converted)
+    with pytest.raises(UserError, match="copies 0: expected 1 to 64"):
+        train(config, settings, converted, tmp_path / "run", lambda *_: None)
+    assert not (tmp_path / "run").exists()
 
 
 def test_a_task_without_objects_is_refused(cabinets, tmp_path):

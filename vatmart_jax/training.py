@@ -21,7 +21,7 @@ from vatmart_jax.files import write_bytes, write_json
 from vatmart_jax.inference import Priors, PriorsConfig
 from vatmart_jax.physics.interface import IMPLS
 from vatmart_jax.pipeline import pictures
-from vatmart_jax.pipeline.run import Run
+from vatmart_jax.pipeline.run import Run, read_metrics
 from vatmart_jax.pipeline.train import Report, Training, run_seconds
 from vatmart_jax.presets import Settings
 
@@ -55,9 +55,10 @@ def train(
     task = TASKS[config["task"]]
     data = Data(folder)
     envs = environments(data, task, config["impl"], settings)
+    networks, copies = settings.perception.networks, settings.evaluation.copies
+    described = PriorsConfig(task.name, task.low, task.high, networks, copies)  # refused before anything is written
     with Run(out, config) as run:
         training = Training(run, envs["train"], settings, config["seed"], report)
-        described = PriorsConfig(task.name, task.low, task.high, training.config.networks, settings.evaluation.copies)
         progress = training.train()
         priors = Priors(described, progress.perception.params)
         priors.save(out / "priors")
@@ -72,7 +73,7 @@ def train(
             )  # fmt: skip
         seconds = run_seconds(progress) | {"evaluate": round(time.monotonic() - evaluated, 1)}
         table = markdown([{"task": task.name, **row} for row in results])
-        pictures.curves(run.metrics, out / "curves.png")
+        pictures.curves(read_metrics(out), out / "curves.png")
         pictures.contact_sheet([folder / i / "picture.png" for i in _objects(envs)], out / "objects.png")
         shown = next(iter(tests.values()), envs["train"])
         draw_priors(priors, shown, training.key("pictures"), out)

@@ -290,7 +290,7 @@ def _augmented(key: jax.Array, config: PerceptionConfig, batch: Batch) -> Batch:
 
 
 def transformed(batch: Batch, transform: Transform, task_is_length: bool = False) -> Batch:
-    """One view of a Batch and all that belongs to it."""
+    """One view of a Batch, mirrored, turned and scaled with all that belongs to it."""
     if batch.joints is not None:
         axis, anchor = transform.directions(batch.joints[0]), transform.points(batch.joints[1])
         # The mirror image of a turn goes the other way about the mirrored axis.

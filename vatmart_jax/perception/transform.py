@@ -28,11 +28,6 @@ class Transform(NamedTuple):
     yaw: jax.Array  # [] rad
     scale: jax.Array  # [] > 0
 
-    @property
-    def inverse(self) -> Transform:
-        """The transform that undoes this one."""
-        return Transform(self.mirrored, jnp.where(self.mirrored, self.yaw, -self.yaw), 1 / self.scale)
-
     def directions(self, v: jax.Array) -> jax.Array:
         """Vectors [..., 3] mirrored and turned, of the same length."""
         return jnp.where(self.mirrored, v * _MIRROR, v) @ self._turn

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import json
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +19,7 @@ from matplotlib import patheffects
 
 _STAGE_CURVES = (
     ("explore", ("success", "reward")),
+    ("course", ("course_error",)),
     ("scorer", ("score_loss",)),
     ("proposal", ("move_loss", "turn_loss", "rotation_loss", "kl_loss")),
     ("actionability", ("actionability_loss", "actionability_target")),
@@ -27,9 +28,8 @@ _STAGE_CURVES = (
 )
 
 
-def curves(metrics: Path, out: Path) -> None:
-    """One panel per stage and metric from metrics.jsonl."""
-    rows = [json.loads(line) for line in metrics.read_text().splitlines()]
+def curves(rows: Sequence[dict[str, Any]], out: Path) -> None:
+    """One panel per stage and metric of what a run logged, see `read_metrics`."""
     panels = [
         (stage, name, [(r["step"], r[name]) for r in rows if r["stage"] == stage and name in r])
         for stage, names in _STAGE_CURVES

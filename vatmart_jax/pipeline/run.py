@@ -117,6 +117,11 @@ def _read_json(path: Path) -> dict[str, Any]:
     return value
 
 
+def read_metrics(folder: Path) -> list[dict[str, Any]]:
+    """What a run logged, a record per unit of work: stage, step, seconds, metrics."""
+    return [json.loads(line) for line in (Path(folder) / "metrics.jsonl").read_text().splitlines()]
+
+
 def read_config(folder: Path) -> dict[str, Any]:
     """The resolved config of a run. Raises RunError where there is none."""
     path = Path(folder) / "config.json"
