@@ -1,6 +1,6 @@
 """Priors that come with the package, by name: one run folder each, without what only a run needs to go on.
 
-Most were trained on PartNet-Mobility's objects: see README.md beside this file for its terms.
+All but `generated-*` were trained on PartNet-Mobility's objects: see README.md beside this file for its terms.
 """
 
 from __future__ import annotations
