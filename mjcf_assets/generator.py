@@ -7,7 +7,7 @@ a seed depends on the seed and i alone.
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from pathlib import Path
 from xml.sax.saxutils import quoteattr
 
@@ -55,10 +55,7 @@ def generate(out: Path, count: int, seed: int) -> list[str]:
     if not 1 <= count < 100_000 or seed < 0:
         raise GeneratorError(f"--count {count} --seed {seed}: expected 1 <= count < 100000 and seed >= 0")
     ids = [f"9{seed:03d}{i:05d}" for i in range(count)]
-    out.mkdir(parents=True, exist_ok=True)
-    others = sorted(p.parent.name for p in out.glob("*/mobility.urdf") if p.parent.name not in ids)
-    if others:
-        raise GeneratorError(f"{out}: holds other objects ({others[0]}, ...); choose an empty folder")
+    make_folder(out, ids)
     splits = {name: {} for name in ("train", "test_shapes", "test_categories", "extra")}
     seen = dict.fromkeys(CYCLE, 0)
     for i, name in enumerate(ids):
@@ -70,6 +67,14 @@ def generate(out: Path, count: int, seed: int) -> list[str]:
         _write(out / name, category, MAKERS[category](rng), rng)
     write_text(out / "splits.json", json.dumps(splits))
     return ids
+
+
+def make_folder(out: Path, ids: Collection[str]) -> None:
+    """Make the folder that is to hold these objects. Raises GeneratorError where it holds others."""
+    out.mkdir(parents=True, exist_ok=True)
+    others = sorted(p.parent.name for p in out.glob("*/mobility.urdf") if p.parent.name not in ids)
+    if others:
+        raise GeneratorError(f"{out}: holds other objects ({others[0]}, ...); choose an empty folder")
 
 
 # Storage furniture and tables

@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from conftest import Box, Cabinet, scene_bank, view_bank
 from scipy import stats
 from scipy.spatial.transform import Rotation
 
@@ -156,6 +157,36 @@ def test_trials_can_begin_at_a_pool_of_known_starts(runs):
     ]
     assert all(len(r) == 1 for r in rows) and len({int(r[0]) for r in rows}) > 2
     assert len(np.unique(state.start.task)) == BATCH
+
+
+class Awning(Cabinet):
+    """A cabinet with a board above the drawer that juts out of the front."""
+
+    def boards(self):
+        front = -self.size[0] / 2 - 0.02
+        return [*super().boards(), Box(np.array([front - 0.06, 0, 0]), np.array([0.06, 0.3, 0.01]))]
+
+
+def test_a_hand_that_an_obstacle_stops_on_the_way_leaves_no_way():
+    """Where the drawer is pushed shut below the board, the hand's long side is in its way, the short one is not."""
+    objects = [Awning("100", "StorageFurniture", "train", (0.40, 0.60, 0.70), 1, 0, (0.0, 0.0, 0.0), 3)]
+    env = Env(scene_bank(objects), view_bank(objects), TASKS["push-drawer"])
+    view, contact = (x.ravel() for x in np.meshgrid(np.arange(3), np.arange(8)))
+    up = jnp.asarray(-env.views.contact_normals[view, contact])
+    starts = {
+        side: Start(
+            jnp.asarray(view, jnp.int32), jnp.asarray(contact, jnp.int32), jnp.full(24, 0.1),
+            g.gripper_frame(up, jnp.broadcast_to(jnp.asarray(axis, jnp.float32), up.shape)),
+        )
+        for side, axis in (("upright", [0, 1, 0]), ("flat", [0, 0, 1]))
+    }  # fmt: skip
+    free, way = jit(env.is_free), jit(env.leaves_way)
+    height = env.views.contacts[view, contact][:, 2]
+    upright, flat = (np.asarray(free(starts[side])) for side in ("upright", "flat"))  # the others are at the handle
+    assert (upright & (height > -0.1)).any() and (upright & (height < -0.13)).any() and flat.any()
+    assert way(starts["flat"])[flat].all()
+    assert not way(starts["upright"])[height > -0.1].any()
+    assert way(starts["upright"])[upright & (height < -0.13)].all()
 
 
 def test_the_first_observation_says_where_the_hand_the_contact_and_the_joint_are(runs):

@@ -86,21 +86,28 @@ def _convert(argv: list[str]) -> None:
 
 
 def _generate(argv: list[str]) -> None:
-    """Make procedural objects in PartNet-Mobility's layout."""
+    """Make objects in PartNet-Mobility's layout: procedural ones, or stretched copies of others."""
     from mjcf_assets.generator import generate
+    from mjcf_assets.stretch import stretched_copies
 
     @dataclass(frozen=True)
     class Generate:
-        """Make procedural objects in PartNet-Mobility's layout, the same ones for the same seed."""
+        """Make objects in PartNet-Mobility's layout, the same ones for the same seed."""
 
         out: Path
-        count: int = 200
+        count: int | None = None
+        """objects, default 200; with --stretch copies of each, default 4"""
+        stretch: Path | None = None
+        """instead of procedural objects, copies of the training objects in this folder, stretched along their axes"""
         seed: int = 0
         json: _Json = False
 
     args = tyro.cli(Generate, args=argv, prog="vatmart generate")
     start = time.monotonic()
-    ids = generate(args.out, args.count, args.seed)
+    if args.stretch is None:
+        ids = generate(args.out, 200 if args.count is None else args.count, args.seed)
+    else:
+        ids = stretched_copies(args.stretch, args.out, 4 if args.count is None else args.count, args.seed)
     _print_result({"objects": len(ids), "seconds": round(time.monotonic() - start, 2)}, args.json)
 
 

@@ -240,9 +240,7 @@ class Env:
 
     def sample_task(self, key: jax.Array, view: jax.Array) -> jax.Array:
         """[B] amounts for views [B]: density of t given q when t is uniform and q then uniform where t fits."""
-        width, q = self._scenes.width[self._view_scene[view]], self._view_q[view]
-        room = width - q if self.task.opening else q
-        high = jnp.minimum(self.task.high, room)
+        width, high = self._scenes.width[self._view_scene[view]], jnp.minimum(self.task.high, self._room(view))
         # p(t | q) is proportional to 1 / (width - t) on [low, high]; inverted here.
         rest = jnp.maximum(width - self.task.low, 1e-3)
         share = jnp.maximum(width - high, 1e-3) / rest
@@ -314,6 +312,17 @@ class Env:
         physics = self._placed(start, -self.config.standoff if depth is None else depth)
         return ~(physics.in_contact | physics.diverged)
 
+    def leaves_way(self, start: Start) -> jax.Array:
+        """[B] bool, the hands would touch nothing on the way that the longest task carries part and hand along: no
+        other open part and no frame is in the way."""
+        longest = jnp.minimum(self.task.high, self._room(start.view))
+
+        def touches(share: jax.Array) -> jax.Array:
+            physics = self._placed(start, -self.config.standoff, share * longest)
+            return physics.in_contact | physics.diverged
+
+        return ~jax.lax.map(touches, jnp.arange(1, g.WAYPOINTS + 1) / g.WAYPOINTS).any(0)
+
     def step(self, state: EnvState, action: jax.Array, abandon: bool = True) -> EnvState:
         """One waypoint from an action [B, 6] in [-1, 1]: move of the fingertips and turn (rotation vector) of the
         hand, both in the joint-local frame. Trials that are done stay as they are; one is done when it succeeds,
@@ -344,15 +353,25 @@ class Env:
 
         return jax.lax.scan(waypoint, self.begin(start), residuals.swapaxes(0, 1))[0]
 
-    def _placed(self, start: Start, depth: float) -> PhysicsState:
-        """The hand with its tips `depth` past the contacts, closed to push and open to pull."""
-        scene, q0 = self._view_scene[start.view], self._view_q[start.view]
-        point = self._contacts[start.view, start.contact]
-        hand = point + (depth - TIP) * start.rotation[:, :, 2]
+    def _room(self, view: jax.Array) -> jax.Array:
+        """[B] how far the parts of views [B] can move in the task's sense."""
+        q = self._view_q[view]
+        return self._scenes.width[self._view_scene[view]] - q if self.task.opening else q
+
+    def _placed(self, start: Start, depth: float, amount: jax.Array | None = None) -> PhysicsState:
+        """The hand with its tips `depth` past the contacts, closed to push and open to pull; part and hand as one moved
+        on by `amount` [B] in the task's sense, if given."""
+        scene, rotation, q = self._view_scene[start.view], start.rotation, self._view_q[start.view]
+        hand = self._contacts[start.view, start.contact] + (depth - TIP) * rotation[:, :, 2]
+        if amount is not None:
+            hinge, axis = self.task.joint_type == HINGE, self._motion_axis(scene)
+            hand = g.carried(hand, axis, self._scenes.anchor[scene], amount, hinge)
+            rotation = g.matrix_from_rotvec(axis * amount[:, None]) @ rotation if hinge else rotation
+            q = q + amount if self.task.opening else q - amount
         n = len(scene)
         fingers = jnp.full((n, 2), FINGER_OPEN if self.task.opening else 0.0)
-        qpos = jnp.concatenate([q0[:, None], jnp.zeros((n, 6)), fingers], -1)
-        return self.physics.reset(scene, jnp.concatenate([hand, g.quat_from_matrix(start.rotation)], -1), qpos)
+        qpos = jnp.concatenate([q[:, None], jnp.zeros((n, 6)), fingers], -1)
+        return self.physics.reset(scene, jnp.concatenate([hand, g.quat_from_matrix(rotation)], -1), qpos)
 
     def _advance(self, state: EnvState, residual: jax.Array) -> EnvState:
         active = ~state.done

@@ -128,20 +128,25 @@ class Explorer:
 
 
 def start_pool(env: Env, key: jax.Array, size: int, progress: Callable[[int], None] = lambda done: None) -> Start:
-    """`size` starts that are free and, when pulling, grasp. Consumes the key.
+    """`size` starts that are free, grasp when pulling, and leave the longest task's way free. Consumes the key.
 
     Raises UserError where fewer than one in two hundred random starts will do: the data does not fit the task.
     """
-    reset = jax.jit(env.reset)
+
+    @jax.jit
+    def attempt(key: jax.Array) -> tuple[Start, jax.Array]:
+        state = env.reset(key)
+        return state.start, state.valid & env.leaves_way(state.start)
+
     kept: list[Start] = []
     found = tried = 0
     while found < size:
         key, sub = jax.random.split(key)
-        state = reset(sub)
-        good = jnp.flatnonzero(state.valid)
-        kept.append(jax.tree.map(lambda x: x[good], state.start))  # noqa: B023
+        start, good = attempt(sub)
+        good = jnp.flatnonzero(good)
+        kept.append(jax.tree.map(lambda x: x[good], start))  # noqa: B023
         found += len(good)
-        tried += len(state.valid)
+        tried += len(start.view)
         progress(min(found, size))
         if tried >= 20 * env.config.batch and found < tried / 200:
             raise UserError(
