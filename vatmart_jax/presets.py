@@ -98,7 +98,7 @@ PRESETS = {
         env=EnvConfig(batch=64),
         explore=ExploreConfig(
             iterations=5000,
-            td3=TD3Config(batch=512, learning_rate=1e-4, capacity=2048, policy_delay=3, updates=6),
+            td3=TD3Config(batch=512, learning_rate=1e-4, saturation=0.0, capacity=2048, policy_delay=3, updates=6),
             noise=(0.1, 0.1 / 2**10),
         ),
         perception=PerceptionConfig(

@@ -15,7 +15,8 @@ def _last(key, shape, dtype=jnp.float32):
 
 
 class Policy(nn.Module):
-    """[..., 33] -> actions [..., 6] in [-1, 1]: four hidden layers. The paper's variance head is unused by TD3."""
+    """[..., 33] -> [..., 6], of which actions in [-1, 1] are the tanh: four hidden layers. The paper's variance head is
+    unused by TD3."""
 
     hidden: int = 512
     actions: int = 6
@@ -25,7 +26,7 @@ class Policy(nn.Module):
         x = obs
         for _ in range(4):
             x = nn.relu(nn.Dense(self.hidden)(x))
-        return jnp.tanh(nn.Dense(self.actions, kernel_init=_last)(x))
+        return nn.Dense(self.actions, kernel_init=_last)(x)
 
 
 class Critic(nn.Module):

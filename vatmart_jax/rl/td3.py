@@ -28,6 +28,9 @@ class TD3Config:
     target_noise_clip: float = 0.2
     reward_scale: float = 0.01
     """rewards of hundreds make values of hundreds, which Adam reaches slowly"""
+    saturation: float = 0.01
+    """penalty for the squares of what actions are the tanh of: where that is large, no gradient comes back and the
+    policy is stuck for good; the paper has 0"""
     capacity: int = 100_000
     updates: int = 64
     """gradient steps per batch of trials"""
@@ -66,6 +69,9 @@ class TD3:
 
     def act(self, policy: Any, obs: jax.Array) -> jax.Array:
         """[B, 33] -> [B, 6] in [-1, 1]."""
+        return jnp.tanh(self._raw(policy, obs))
+
+    def _raw(self, policy: Any, obs: jax.Array) -> jax.Array:
         return self._policy.apply(policy, obs)  # pyright: ignore[reportReturnType]
 
     def explore(self, policy: Any, obs: jax.Array, key: jax.Array, noise: jax.Array, random: jax.Array) -> jax.Array:
@@ -113,7 +119,9 @@ class TD3:
             first = jax.tree.map(lambda x: x[0], state.critics)
 
             def policy_loss(policy):
-                return -jnp.mean(self._value(first, steps.obs, self.act(policy, steps.obs)))
+                raw = self._raw(policy, steps.obs)
+                value = self._value(first, steps.obs, jnp.tanh(raw))
+                return config.saturation * jnp.mean(raw**2) - jnp.mean(value)
 
             grads = jax.grad(policy_loss)(state.policy)
             changes, policy_opt = self._optimizer.update(grads, state.policy_opt)
