@@ -1,4 +1,5 @@
 from collections import deque
+from dataclasses import replace
 
 import jax
 import jax.numpy as jnp
@@ -66,6 +67,25 @@ def test_td3_finds_the_best_action_and_its_discounted_value(td3, learned):
     np.testing.assert_allclose(value.mean(1), 1.0, atol=0.15)
     value = td3._values(state.critics, obs.at[:, 3].set(0), jnp.zeros((500, ACTION)))
     np.testing.assert_allclose(value.mean(1), 0.5, atol=0.15)
+
+
+def saturated(state: TD3State) -> TD3State:
+    """A policy whose actions are all at the end of their range."""
+    policy = jax.tree.map(jnp.copy, state.policy)
+    policy["params"]["Dense_4"]["bias"] = jnp.full(ACTION, 20.0)
+    return state.replace(policy=policy, target_policy=policy)
+
+
+def test_a_saturated_policy_finds_its_way_back_and_without_the_penalty_does_not(td3, learn, fresh, replay):
+    last = jax.random.uniform(jax.random.key(3), (500, OBSERVATION), minval=-0.9, maxval=0.9).at[:, 3].set(1)
+    stuck = jax.jit(TD3(replace(CONFIG, saturation=0.0), OBSERVATION, ACTION).learn)
+    error = {}
+    for name, step in (("with", learn), ("without", stuck)):
+        state = saturated(fresh)
+        for k in range(3):
+            state, _ = step(state, replay, jax.random.key(k))
+        error[name] = float(np.abs(td3.act(state.policy, last) - best_action(last)).mean())
+    assert error["with"] < 0.15 and error["without"] > 0.5
 
 
 def test_learning_is_determined_by_its_keys(td3, learn, learned, fresh, replay):
