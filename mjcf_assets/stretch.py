@@ -19,6 +19,7 @@ from vatmart_jax.files import whole_folder, write_text
 
 LIMIT = 0.35  # of the logarithm of a length's factor
 _ASKEW = 0.02  # sine of the angle by which a frame may be off its parent's axes
+# Pictures are large and copies are for training, which sees no colours; the bounding box is another one.
 _LEFT_BEHIND = shutil.ignore_patterns("*.urdf", "images", "bounding_box.json")
 
 

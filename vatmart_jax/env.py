@@ -307,21 +307,18 @@ class Env:
         obs, distance = self._observe(state)
         return state.replace(obs=obs, info={**state.info, "tip_distance": distance})
 
-    def is_free(self, start: Start, depth: float | None = None) -> jax.Array:
-        """[B] bool, the start poses touch nothing; or those with the fingertips `depth` past the contact points."""
-        physics = self._placed(start, -self.config.standoff if depth is None else depth)
+    def is_free(self, start: Start, depth: float | None = None, amount: jax.Array | None = None) -> jax.Array:
+        """[B] bool, the start poses touch nothing; or those with the fingertips `depth` past the contact points, or
+        with part and hand moved on by `amount` [B] in the task's sense."""
+        physics = self._placed(start, -self.config.standoff if depth is None else depth, amount)
         return ~(physics.in_contact | physics.diverged)
 
     def leaves_way(self, start: Start) -> jax.Array:
         """[B] bool, the hands would touch nothing on the way that the longest task carries part and hand along: no
         other open part and no frame is in the way."""
         longest = jnp.minimum(self.task.high, self._room(start.view))
-
-        def touches(share: jax.Array) -> jax.Array:
-            physics = self._placed(start, -self.config.standoff, share * longest)
-            return physics.in_contact | physics.diverged
-
-        return ~jax.lax.map(touches, jnp.arange(1, g.WAYPOINTS + 1) / g.WAYPOINTS).any(0)
+        shares = jnp.arange(1, g.WAYPOINTS + 1) / g.WAYPOINTS
+        return jax.lax.map(lambda share: self.is_free(start, amount=share * longest), shares).all(0)
 
     def step(self, state: EnvState, action: jax.Array, abandon: bool = True) -> EnvState:
         """One waypoint from an action [B, 6] in [-1, 1]: move of the fingertips and turn (rotation vector) of the

@@ -150,7 +150,7 @@ def start_pool(env: Env, key: jax.Array, size: int, progress: Callable[[int], No
         progress(min(found, size))
         if tried >= 20 * env.config.batch and found < tried / 200:
             raise UserError(
-                f"only {found} of {tried} random starts of task {env.task.name} are free and hold: "
+                f"only {found} of {tried} random starts of task {env.task.name} are free, hold and have a free way: "
                 "the objects do not fit the gripper; look at the conversion's report"
             )
     return jax.tree.map(lambda *parts: jnp.concatenate(parts)[:size], *kept)
