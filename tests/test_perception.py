@@ -223,6 +223,21 @@ def test_the_course_of_a_mirrored_turned_and_scaled_scene_is_that_of_the_scene(w
             )
 
 
+def test_a_course_about_a_hinge_is_an_arc_however_features_and_tasks_broadcast(world) -> None:
+    networks = Networks(replace(COURSE.networks, hinge=True))
+    params, clouds = networks.init(jax.random.key(0)), world[0]
+    points, grouping = jax.tree.map(lambda a: a[0], (clouds.points, clouds.grouping))
+    f, contact, task = networks.features(params, points, grouping), clouds.contacts[0], jnp.array([[0.2], [0.6]])
+    axis, arm = networks.hinge(params, f, contact, task)
+    places, turn = places_and_turn(networks.course(params, f, contact, task))
+    assert places.shape == (2, len(contact), 4, 3) and turn.shape == axis.shape == arm.shape == (2, len(contact), 3)
+    np.testing.assert_allclose(turn / task[..., None], g.normalize(axis), atol=1e-3)
+    distance, radius = jnp.linalg.norm(places - arm[..., None, :], axis=-1), jnp.linalg.norm(arm, axis=-1)
+    np.testing.assert_allclose(distance, jnp.broadcast_to(radius[..., None], distance.shape), rtol=1e-2)
+    with pytest.raises(ValueError, match="a hinge is told by the course's head"):
+        replace(COURSE.networks, course=(), hinge=True)
+
+
 def test_an_ensemble_says_the_mean_over_copies_of_what_it_proposes_for_the_view(world, data) -> None:
     clouds, networks = world[0], Networks(COURSE.networks)
     params, ensemble = t.begin(jax.random.key(0), COURSE).params, Ensemble(networks, 3)
@@ -258,15 +273,18 @@ def test_disturbed_courses_are_off_by_the_share_asked_for() -> None:
     np.testing.assert_allclose(t._disturbed(jax.random.key(0), course, 0.0), course, rtol=1e-6)
 
 
-def test_a_course_can_be_learned_and_is_asked_for_labels(world, data) -> None:
-    clouds, fresh = world[0], t.begin(jax.random.key(0), COURSE)
+@pytest.mark.parametrize("hinge", [False, True], ids=["along a slide", "about a hinge"])
+def test_a_course_can_be_learned_and_is_asked_for_labels(world, data, hinge: bool) -> None:
+    # These clouds do not tell a scene from its mirror image, in which a hinge turns the other way.
+    networks = replace(COURSE.networks, hinge=hinge)
+    config = replace(COURSE, task_is_length=not hinge, mirror=False, networks=networks)
+    clouds, fresh = world[0], t.begin(jax.random.key(0), config)
     with pytest.raises(ValueError, match="the clouds come without joints"):
-        t.train(fresh, clouds, data, COURSE, "course", 1)
-    along = jnp.broadcast_to(jnp.array([1.0, 0.0, 0.0]), (len(clouds), 3))
+        t.train(fresh, clouds, data, config, "course", 1)
+    along = jnp.broadcast_to(jnp.array([0.0, 0.6, 0.8]), (len(clouds), 3))
     errors: list[float] = []
-    config = replace(COURSE, task_is_length=True)
     after = t.train(
-        fresh, clouds.replace(joints=(along, jnp.zeros_like(along))), data, config, "course", 60,
+        fresh, clouds.replace(joints=(along, jnp.full_like(along, 0.5))), data, config, "course", 100,
         lambda _, metrics: errors.append(metrics["course_error"]),
     )  # fmt: skip
     assert errors[-1] < 0.5 * errors[0]

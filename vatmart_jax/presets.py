@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import jax
 
@@ -78,9 +78,12 @@ PRESETS = {
     "quick": Settings(explore=ExploreConfig(iterations=60, pool=2048), perception=_ON_CPU),
     "cpu": Settings(
         explore=ExploreConfig(iterations=100, pool=4096),
-        perception=_ON_CPU,
+        perception=replace(
+            _ON_CPU, learning_rate=2e-3,
+            networks=replace(_ON_CPU.networks, pointnet=replace(SMALL, context=(64, 128))),
+        ),
         schedule=Schedule(
-            samples=400_000, collect=128, course=3000, scorer=200, proposal=2000, actionability=200, finetune=16,
+            samples=400_000, collect=128, course=6000, scorer=200, proposal=2000, actionability=200, finetune=16,
             finetune_batches=64, finetune_steps=1500,
         ),
     ),

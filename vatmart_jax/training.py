@@ -22,7 +22,7 @@ from vatmart_jax.inference import Priors, PriorsConfig
 from vatmart_jax.physics.interface import IMPLS
 from vatmart_jax.pipeline import pictures
 from vatmart_jax.pipeline.run import Run, read_metrics
-from vatmart_jax.pipeline.train import Report, Training, run_seconds
+from vatmart_jax.pipeline.train import Report, Training, perception_config, run_seconds
 from vatmart_jax.presets import Settings
 
 _PICTURES = 6
@@ -55,7 +55,7 @@ def train(
     task = TASKS[config["task"]]
     data = Data(folder)
     envs = environments(data, task, config["impl"], settings)
-    networks, copies = settings.perception.networks, settings.evaluation.copies
+    networks, copies = perception_config(settings, task).networks, settings.evaluation.copies
     described = PriorsConfig(task.name, task.low, task.high, networks, copies)  # refused before anything is written
     with Run(out, config) as run:
         training = Training(run, envs["train"], settings, config["seed"], report)

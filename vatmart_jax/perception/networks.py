@@ -15,7 +15,7 @@ import flax.linen as nn
 import jax
 import jax.numpy as jnp
 
-from vatmart_jax.geometry import TRAJECTORY, WAYPOINTS, matrix_from_rot6d, rot6d_from_matrix, since_start
+from vatmart_jax.geometry import TRAJECTORY, WAYPOINTS, carried, matrix_from_rot6d, rot6d_from_matrix, since_start
 from vatmart_jax.perception.pointnet2 import Grouping, PointNet2, PointNetConfig
 
 Params = dict  # of the networks' names to their Flax parameters
@@ -57,10 +57,14 @@ class NetworksConfig:
     course: tuple[int, ...] = ()
     """Hidden widths of a head that tells where the touched point goes when the task is done; the others read what it
     says. Without it, as in the paper, they find out for themselves."""
+    hinge: bool = False
+    """The course is an arc: its head tells where the hinge is, the rest is geometry. For doors."""
 
     def __post_init__(self) -> None:
         if self.course and self.separate:
             raise ValueError("a course needs the shared encoder: leave out one of `course` and `separate`")
+        if self.hinge and not self.course:
+            raise ValueError("a hinge is told by the course's head: give `course` its widths, or leave out `hinge`")
 
 
 class Features(NamedTuple):
@@ -176,7 +180,16 @@ class Networks:
     def course(self, params: Params, f: Features, contact: jax.Array, task: jax.Array) -> jax.Array:
         """[..., 15] what becomes of a point of the part while the task is done: where it is after each quarter,
         relative to the contact, and the rotation vector of the part at the end; scaled (see `places_and_turn`)."""
-        return self._course.apply({"params": params["course"]}, f.scorer, contact, task)  # pyright: ignore
+        if not self.config.hinge:
+            return self._course.apply({"params": params["course"]}, f.scorer, contact, task)  # pyright: ignore
+        axis, arm = self.hinge(params, f, contact, task)
+        return course_of(axis / jnp.sqrt(jnp.sum(axis**2, -1, keepdims=True) + 1e-6), arm, task, hinge=True)
+
+    def hinge(self, params: Params, f: Features, contact: jax.Array, task: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """The axis [..., 3] that the part turns about, of a length near 1 and signed as the task turns, and the way
+        [..., 3] (unit lengths) from the contact to the nearest point on it; for networks with `hinge`."""
+        out = self._course.apply({"params": params["course"]}, f.scorer, contact, task)
+        return out[..., :3], out[..., 3:] / MOVE_SCALE  # pyright: ignore
 
     def _at(
         self,
@@ -211,7 +224,7 @@ class Networks:
 
     @property
     def _course(self) -> Head:
-        return Head(self.config, (*self.config.course, COURSE))
+        return Head(self.config, (*self.config.course, 6 if self.config.hinge else COURSE))
 
 
 class Head(nn.Module):
@@ -263,6 +276,18 @@ def places_and_turn(course: jax.Array) -> tuple[jax.Array, jax.Array]:
 def pack_course(places: jax.Array, turn: jax.Array) -> jax.Array:
     """The inverse of `places_and_turn`."""
     return jnp.concatenate([MOVE_SCALE * _flat(places), TURN_SCALE * turn], -1)
+
+
+def course_of(axis: jax.Array, arm: jax.Array, task: jax.Array, hinge: bool) -> jax.Array:
+    """The course [..., 15] of points whose part turns about an axis (`hinge`) or slides along it by task [...].
+
+    axis: [..., 3] unit; arm: [..., 3] from the point to any point on a hinge's axis.
+    """
+    amount = task[..., None] * jnp.arange(1, WAYPOINTS + 1) / WAYPOINTS
+    arm = arm[..., None, :]
+    places = carried(jnp.zeros_like(arm), axis[..., None, :], arm, amount, hinge)
+    turn = axis * task[..., None]
+    return pack_course(places, turn if hinge else jnp.zeros_like(turn))
 
 
 def _flat(x: jax.Array) -> jax.Array:

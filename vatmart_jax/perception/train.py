@@ -17,11 +17,19 @@ import jax.numpy as jnp
 import optax
 from flax import struct
 
-from vatmart_jax.geometry import WAYPOINTS, carried
+from vatmart_jax.geometry import WAYPOINTS
 from vatmart_jax.perception import losses
 from vatmart_jax.perception.ask import Ensemble
 from vatmart_jax.perception.clouds import Clouds
-from vatmart_jax.perception.networks import Features, Networks, NetworksConfig, Params, pack_course, places_and_turn
+from vatmart_jax.perception.networks import (
+    Features,
+    Networks,
+    NetworksConfig,
+    Params,
+    course_of,
+    pack_course,
+    places_and_turn,
+)
 from vatmart_jax.perception.pointnet2 import Grouping
 from vatmart_jax.perception.transform import Transform
 
@@ -111,7 +119,7 @@ class PerceptionConfig:
     kl_free: float = 6.0
     """nats of it that cost nothing, so that the posterior does not collapse before the decoder has learned to listen"""
     course_weight: float = 50.0
-    """of the L1 of the touched point's course"""
+    """of the L1 of the touched point's course, and of its hinge where the networks tell it"""
     course_noise: float = 0.15
     """the scorer learns with courses off by about this share, as they are on objects that it has not seen"""
     actionability_weight: float = 5.0
@@ -325,6 +333,11 @@ def _loss(
         off = said - truth
         loss = jnp.abs(off).mean()
         total += config.course_weight * loss
+        if config.networks.hinge:  # the arc alone teaches slowly where its axis is
+            axis, arm = networks.hinge(params, f, contact, task)
+            true_axis, to_axis = batch.joints[0][:, None], batch.joints[1][:, None] - contact  # pyright: ignore
+            true_arm = to_axis - true_axis * jnp.sum(true_axis * to_axis, -1, keepdims=True)
+            total += config.course_weight * (jnp.abs(axis - true_axis).mean() + 2 * jnp.abs(arm - true_arm).mean())
         places, _ = places_and_turn(off)
         metrics |= {"course_loss": loss, "course_error": jnp.linalg.norm(places[..., -1, :], axis=-1).mean()}
     if "scorer" in heads:
@@ -358,11 +371,7 @@ def _loss(
 def true_course(contact: jax.Array, axis: jax.Array, anchor: jax.Array, task: jax.Array, hinge: bool) -> jax.Array:
     """[V, Q, 15] what `Networks.course` should say of contacts [V, Q, 3] and tasks [V, Q] where the joints are axis
     and anchor [V, 3]."""
-    contact, axis, anchor = contact[:, :, None], axis[:, None, None], anchor[:, None, None]
-    quarters = jnp.arange(1, WAYPOINTS + 1) / WAYPOINTS
-    places = carried(contact, axis, anchor, task[..., None] * quarters, hinge) - contact
-    turn = axis[:, 0] * task[..., None]
-    return pack_course(places, turn if hinge else jnp.zeros_like(turn))
+    return course_of(axis[:, None], anchor[:, None] - contact, task, hinge)
 
 
 def _disturbed(key: jax.Array, course: jax.Array, share: float) -> jax.Array:

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from flax import struct
 
-from vatmart_jax.bank import SLIDE
+from vatmart_jax.bank import HINGE, SLIDE
 from vatmart_jax.env import Env, Start, Task
 from vatmart_jax.perception import train as perception
 from vatmart_jax.perception.ask import Ensemble, score_trajectories
@@ -231,10 +231,12 @@ class Training:
 
 
 def perception_config(settings: Settings, task: Task) -> PerceptionConfig:
-    """The settings' perception config with the task's limits in it."""
+    """The settings' perception config with the task's limits in it; a door's course is an arc."""
+    networks = settings.perception.networks
     return replace(
         settings.perception, low=task.low, high=task.high, tolerance=settings.env.tolerance, shift=task.shift,
         task_is_length=task.joint_type == SLIDE,
+        networks=replace(networks, hinge=bool(networks.course) and task.joint_type == HINGE),
     )  # fmt: skip
 
 
