@@ -162,6 +162,14 @@ def _damage(folder: Path) -> None:
             path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
 
 
+def test_metrics_that_are_missing_or_cut_are_an_error_that_names_them(tmp_path):
+    for text in (None, '{"stage": "explore", "st'):
+        if text:
+            (tmp_path / "metrics.jsonl").write_text(text)
+        with pytest.raises(RunError, match=r"metrics\.jsonl: cannot be read .*train again"):
+            read_metrics(tmp_path)
+
+
 def test_unknown_names_are_refused_by_name():
     with pytest.raises(UserError, match="--task push-lid: not one of push-door, pull-door"):
         resolve("push-lid", "quick", "c", 0, TINY, None)

@@ -118,8 +118,15 @@ def _read_json(path: Path) -> dict[str, Any]:
 
 
 def read_metrics(folder: Path) -> list[dict[str, Any]]:
-    """What a run logged, a record per unit of work: stage, step, seconds, metrics."""
-    return [json.loads(line) for line in (Path(folder) / "metrics.jsonl").read_text().splitlines()]
+    """What a run logged, a record per unit of work: stage, step, seconds, metrics.
+
+    Raises RunError where that is missing or cut.
+    """
+    path = Path(folder) / "metrics.jsonl"
+    try:
+        return [json.loads(line) for line in path.read_text().splitlines()]
+    except (OSError, ValueError) as e:
+        raise RunError(f"{path}: cannot be read ({e}); train again into another folder") from e
 
 
 def read_config(folder: Path) -> dict[str, Any]:
