@@ -20,6 +20,7 @@ from vatmart_jax.perception.networks import (
     Features,
     Networks,
     NetworksConfig,
+    course_of,
     pack_course,
     places_and_turn,
 )
@@ -234,6 +235,13 @@ def test_a_course_about_a_hinge_is_an_arc_however_features_and_tasks_broadcast(w
     np.testing.assert_allclose(turn / task[..., None], g.normalize(axis), atol=1e-3)
     distance, radius = jnp.linalg.norm(places - arm[..., None, :], axis=-1), jnp.linalg.norm(arm, axis=-1)
     np.testing.assert_allclose(distance, jnp.broadcast_to(radius[..., None], distance.shape), rtol=1e-2)
+    # What the head is taught leads to the course that it is taught.
+    joints = tuple(x[None] for x in (g.normalize(jnp.array([0.1, 0.2, 1.0])), jnp.array([0.3, -0.4, 0.7])))
+    contact, task = contact[None], jnp.full((1, len(contact)), 0.5)
+    true_axis, true_arm = t.true_hinge(contact, *joints)
+    np.testing.assert_allclose(jnp.sum(true_axis * true_arm, -1), 0, atol=1e-6)
+    truth = t.true_course(contact, *joints, task, hinge=True)
+    np.testing.assert_allclose(course_of(true_axis, true_arm, task, hinge=True), truth, atol=1e-5)
     with pytest.raises(ValueError, match="a hinge is told by the course's head"):
         replace(COURSE.networks, course=(), hinge=True)
 

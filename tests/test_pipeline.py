@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from vatmart_jax.config import from_json, to_json
-from vatmart_jax.env import EnvConfig
+from vatmart_jax.env import TASKS, EnvConfig
 from vatmart_jax.errors import UserError
 from vatmart_jax.evaluation.evaluate import METRICS, evaluate
 from vatmart_jax.perception.networks import NetworksConfig
@@ -18,6 +18,7 @@ from vatmart_jax.perception.train import PerceptionConfig
 from vatmart_jax.physics import PhysicsConfig
 from vatmart_jax.pipeline.explore import ExploreConfig
 from vatmart_jax.pipeline.run import Run, RunError, read_metrics
+from vatmart_jax.pipeline.train import perception_config
 from vatmart_jax.presets import PRESETS, EvaluationConfig, Schedule, Settings, default_preset
 from vatmart_jax.rl.td3 import TD3Config
 from vatmart_jax.training import resolve, train
@@ -29,7 +30,7 @@ TINY = Settings(
     perception=PerceptionConfig(
         networks=NetworksConfig(
             pointnet=PointNetConfig(64, (Level(16, 0.3, 4, (16,)), Level(4, 0.8, 4, (16,))), ((16,), (16,)), 16),
-            course=(16,),
+            course=(16,), hinge=True,
         ),
         views=2, queries=4, probes=2, proposals=4, best=2, steps_per_call=3,
     ),
@@ -199,6 +200,13 @@ def test_the_bundled_objects_are_quick_and_own_ones_get_what_the_machine_can_do(
     assert default_preset(own_data=False) == "quick" and default_preset(own_data=True) == "cpu"
     monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
     assert default_preset(own_data=False) == "quick" and default_preset(own_data=True) == "gpu"
+
+
+def test_doors_have_a_hinge_where_the_settings_say_so_and_drawers_never():
+    plain = replace(TINY, perception=replace(TINY.perception, networks=NetworksConfig()))
+    for name, task in TASKS.items():
+        assert perception_config(TINY, task).networks.hinge == name.endswith("door")
+        assert not perception_config(plain, task).networks.hinge
 
 
 @pytest.mark.parametrize("name", PRESETS)

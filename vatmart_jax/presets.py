@@ -72,7 +72,9 @@ class Settings:
 
 
 # Two cores: small encoders, and few probes of few proposals where the paper has the mean of the best 5 of 100.
-_ON_CPU = PerceptionConfig(networks=NetworksConfig(pointnet=SMALL, course=(128, 128)), probes=4, proposals=32, best=2)
+_ON_CPU = PerceptionConfig(
+    networks=NetworksConfig(pointnet=SMALL, course=(128, 128), hinge=True), probes=4, proposals=32, best=2
+)
 
 PRESETS = {
     "quick": Settings(explore=ExploreConfig(iterations=60, pool=2048), perception=_ON_CPU),
@@ -90,7 +92,7 @@ PRESETS = {
     "gpu": Settings(
         env=EnvConfig(batch=4096),
         explore=ExploreConfig(iterations=300, pool=65536, td3=TD3Config(batch=1024, capacity=1_000_000)),
-        perception=PerceptionConfig(networks=NetworksConfig(course=(128, 128)), views=32),
+        perception=PerceptionConfig(networks=NetworksConfig(course=(128, 128), hinge=True), views=32),
         schedule=Schedule(
             samples=2_000_000, collect=100, course=3000, scorer=10_000, proposal=10_000, actionability=3000,
             curiosity=30, curiosity_steps=200, finetune=10, finetune_batches=20, finetune_steps=3000,

@@ -15,7 +15,15 @@ import flax.linen as nn
 import jax
 import jax.numpy as jnp
 
-from vatmart_jax.geometry import TRAJECTORY, WAYPOINTS, carried, matrix_from_rot6d, rot6d_from_matrix, since_start
+from vatmart_jax.geometry import (
+    TRAJECTORY,
+    WAYPOINTS,
+    carried,
+    matrix_from_rot6d,
+    normalize,
+    rot6d_from_matrix,
+    since_start,
+)
 from vatmart_jax.perception.pointnet2 import Grouping, PointNet2, PointNetConfig
 
 Params = dict  # of the networks' names to their Flax parameters
@@ -26,6 +34,7 @@ TASK_SCALE = 3.0
 MOVE_SCALE = 5.0
 TURN_SCALE = 2.0
 COURSE = 3 * WAYPOINTS + 3
+AXIS_AND_ARM = 6
 SCALE = (1.0,) * 6 + ((MOVE_SCALE,) * 3 + (TURN_SCALE,) * 3) * WAYPOINTS  # of the 30 numbers of a trajectory
 
 
@@ -58,7 +67,7 @@ class NetworksConfig:
     """Hidden widths of a head that tells where the touched point goes when the task is done; the others read what it
     says. Without it, as in the paper, they find out for themselves."""
     hinge: bool = False
-    """The course is an arc: its head tells where the hinge is, the rest is geometry. For doors."""
+    """The course of a door is an arc: its head tells where the hinge is, the rest is geometry. Drawers have none."""
 
     def __post_init__(self) -> None:
         if self.course and self.separate:
@@ -183,7 +192,7 @@ class Networks:
         if not self.config.hinge:
             return self._course.apply({"params": params["course"]}, f.scorer, contact, task)  # pyright: ignore
         axis, arm = self.hinge(params, f, contact, task)
-        return course_of(axis / jnp.sqrt(jnp.sum(axis**2, -1, keepdims=True) + 1e-6), arm, task, hinge=True)
+        return course_of(normalize(axis), arm, task, hinge=True)
 
     def hinge(self, params: Params, f: Features, contact: jax.Array, task: jax.Array) -> tuple[jax.Array, jax.Array]:
         """The axis [..., 3] that the part turns about, of a length near 1 and signed as the task turns, and the way
@@ -224,7 +233,7 @@ class Networks:
 
     @property
     def _course(self) -> Head:
-        return Head(self.config, (*self.config.course, 6 if self.config.hinge else COURSE))
+        return Head(self.config, (*self.config.course, AXIS_AND_ARM if self.config.hinge else COURSE))
 
 
 class Head(nn.Module):

@@ -335,9 +335,10 @@ def _loss(
         total += config.course_weight * loss
         if config.networks.hinge:  # the arc alone teaches slowly where its axis is
             axis, arm = networks.hinge(params, f, contact, task)
-            true_axis, to_axis = batch.joints[0][:, None], batch.joints[1][:, None] - contact  # pyright: ignore
-            true_arm = to_axis - true_axis * jnp.sum(true_axis * to_axis, -1, keepdims=True)
-            total += config.course_weight * (jnp.abs(axis - true_axis).mean() + 2 * jnp.abs(arm - true_arm).mean())
+            true_axis, true_arm = true_hinge(contact, *batch.joints)  # pyright: ignore
+            hinge_loss = jnp.abs(axis - true_axis).mean() + 2 * jnp.abs(arm - true_arm).mean()
+            total += config.course_weight * hinge_loss
+            metrics |= {"hinge_loss": hinge_loss}
         places, _ = places_and_turn(off)
         metrics |= {"course_loss": loss, "course_error": jnp.linalg.norm(places[..., -1, :], axis=-1).mean()}
     if "scorer" in heads:
@@ -372,6 +373,13 @@ def true_course(contact: jax.Array, axis: jax.Array, anchor: jax.Array, task: ja
     """[V, Q, 15] what `Networks.course` should say of contacts [V, Q, 3] and tasks [V, Q] where the joints are axis
     and anchor [V, 3]."""
     return course_of(axis[:, None], anchor[:, None] - contact, task, hinge)
+
+
+def true_hinge(contact: jax.Array, axis: jax.Array, anchor: jax.Array) -> tuple[jax.Array, jax.Array]:
+    """What `Networks.hinge` should say of contacts [V, Q, 3] where the hinges are axis and anchor [V, 3]: the axis
+    [V, 1, 3], and the way [V, Q, 3] from the contact to the nearest point on it."""
+    axis, arm = axis[:, None], anchor[:, None] - contact
+    return axis, arm - axis * jnp.sum(axis * arm, -1, keepdims=True)
 
 
 def _disturbed(key: jax.Array, course: jax.Array, share: float) -> jax.Array:

@@ -231,12 +231,12 @@ class Training:
 
 
 def perception_config(settings: Settings, task: Task) -> PerceptionConfig:
-    """The settings' perception config with the task's limits in it; a door's course is an arc."""
+    """The settings' perception config with the task's limits in it; drawers have no hinge."""
     networks = settings.perception.networks
     return replace(
         settings.perception, low=task.low, high=task.high, tolerance=settings.env.tolerance, shift=task.shift,
         task_is_length=task.joint_type == SLIDE,
-        networks=replace(networks, hinge=bool(networks.course) and task.joint_type == HINGE),
+        networks=replace(networks, hinge=networks.hinge and task.joint_type == HINGE),
     )  # fmt: skip
 
 
