@@ -15,6 +15,7 @@ from typing import Any
 
 import tyro
 
+from vatmart_jax.data import Data
 from vatmart_jax.errors import UserError, at_least_one, one_of
 from vatmart_jax.evaluation.metrics import wilson_interval
 from vatmart_jax.files import write_json
@@ -47,7 +48,7 @@ def run(args: Curiosity, seed: int, weight: float, out: Path, bars: Bars) -> dic
     if (out / "result.json").is_file() and read_config(out) == config:
         return json.loads((out / "result.json").read_text())
     bars.say(f"{out.name}: seed {seed}, curiosity weight {weight:g}")
-    result, _ = train(config, settings, args.data, out, bars)
+    result, _ = train(config, settings, Data(args.data), out, bars)
     return result
 
 

@@ -25,14 +25,13 @@ from vatmart_jax.env import TASKS
 from vatmart_jax.errors import UserError
 from vatmart_jax.evaluation.evaluate import evaluate_split
 from vatmart_jax.files import write_json
-from vatmart_jax.inference import Priors, PriorsConfig
-from vatmart_jax.perception import train as perception
+from vatmart_jax.inference import Priors
 from vatmart_jax.physics.interface import default_impl
 from vatmart_jax.pipeline.run import Run, read_config
 from vatmart_jax.pipeline.train import STAGES, Training, run_seconds
 from vatmart_jax.presets import Settings
 from vatmart_jax.progress import Bars
-from vatmart_jax.training import environments
+from vatmart_jax.training import environments, priors_config
 
 
 @dataclass(frozen=True)
@@ -82,15 +81,12 @@ def main(args: Study) -> None:
             config = {**described, "settings": to_json(own), "trials_of": str(args.run)}
             with Run(args.out / label, config) as run:
                 training = Training(run, envs["train"], own, described["seed"], bars)
-                begun = done.replace(
-                    perception=perception.begin(training.key("networks"), training.config),
-                    stage=jnp.int32(STAGES.index("course")), done=jnp.int32(0), seconds=jnp.zeros(len(STAGES)),
+                begun = training.beginning().replace(
+                    explore=done.explore, samples=done.samples, stored=done.stored,
+                    stage=jnp.int32(STAGES.index("course")),
                 )  # fmt: skip
                 progress = training.train(begun)
-            described_priors = PriorsConfig(
-                task.name, task.low, task.high, training.config.networks, own.evaluation.copies
-            )
-            priors = Priors(described_priors, progress.perception.params)
+            priors = Priors(priors_config(own, task), progress.params)
             rows = []
             for number, (split, env) in enumerate(envs.items()):
                 key = jax.random.fold_in(jax.random.key(args.seed), number)

@@ -28,7 +28,7 @@ class Pretrain:
 
 
 def main(args: Pretrain) -> None:
-    config = {**read_config(args.run), "data": None}  # where the objects lay is nobody's business
+    config = {**read_config(args.run), "data": None, "more_data": []}  # where the objects lay is nobody's business
     priors = Priors.load(args.run)
     with whole_folder(pretrained.FOLDER / args.name) as folder:
         write_json(folder / "config.json", config)

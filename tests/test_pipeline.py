@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from vatmart_jax.config import from_json, to_json
+from vatmart_jax.data import Data
 from vatmart_jax.env import TASKS, EnvConfig
 from vatmart_jax.errors import UserError
 from vatmart_jax.evaluation.evaluate import METRICS, evaluate
@@ -36,7 +37,7 @@ TINY = Settings(
     ),
     schedule=Schedule(
         samples=512, collect=2, course=3, scorer=6, proposal=6, actionability=3, curiosity=2, curiosity_iterations=1,
-        curiosity_steps=3, finetune=1, finetune_batches=1, finetune_steps=3,
+        curiosity_steps=3, finetune=2, finetune_batches=1, finetune_steps=3, members=2,
     ),
     evaluation=EvaluationConfig(trials=24, proposals=4, copies=2),
 )  # fmt: skip
@@ -52,7 +53,7 @@ def converted(cabinets, tmp_path_factory) -> Path:
 
 def run(converted: Path, out: Path, task: str = "push-drawer", seed: int = 0, report=lambda *_: None):
     config = resolve(task, "quick", "c", seed, TINY, converted)
-    return train(config, TINY, converted, out, report)
+    return train(config, TINY, Data(converted), out, report)
 
 
 @pytest.fixture(scope="module")
@@ -182,7 +183,7 @@ def test_a_number_of_copies_that_cannot_be_is_refused_before_anything_is_written
     settings = replace(TINY, evaluation=EvaluationConfig(copies=0))
     config = resolve("push-drawer", "quick", "c", 0, settings, converted)
     with pytest.raises(UserError, match="copies 0: expected 1 to 64"):
-        train(config, settings, converted, tmp_path / "run", lambda *_: None)
+        train(config, settings, Data(converted), tmp_path / "run", lambda *_: None)
     assert not (tmp_path / "run").exists()
 
 

@@ -12,8 +12,10 @@ and offset the URDF's joint uses.
 from __future__ import annotations
 
 import zipfile
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -98,6 +100,27 @@ class SceneBank:
             out["hull_start"] = np.cumsum([0] + [len(h) for h in hulls]).astype(np.int32)
         return SceneBank(**out)
 
+    @classmethod
+    def joined(cls, banks: Sequence[SceneBank]) -> SceneBank:
+        """One bank of the Scenes of several, in their order. Raises ValueError where collision geometry differs."""
+        if len(kinds := {bank.collision for bank in banks}) > 1:
+            raise ValueError(f"their collision geometry differs ({', '.join(sorted(kinds))})")
+        table = lambda name: np.concatenate([getattr(bank, name) for bank in banks])  # noqa: E731
+        out: dict[str, Any] = {name: table(name) for name in (*_PER_SCENE, "hull_vertices", "box_size")}
+        out["hull_start"] = _starts(bank.hull_start for bank in banks)
+        shapes = np.cumsum([0] + [max(len(bank.hull_start) - 1, len(bank.box_size)) for bank in banks])
+        statics, parts = (_starts(getattr(bank, name) for bank in banks) for name in ("static_start", "part_start"))
+        out["static_start"], out["part_start"] = statics, statics[-1] + parts
+        # All banks' statics come before all banks' parts, as in each of them.
+        middle = [bank.static_start[-1] for bank in banks]
+        for name in _PER_INSTANCE:
+            columns = [getattr(bank, name) for bank in banks]
+            if name == "instance_shape":
+                columns = [column + first for column, first in zip(columns, shapes, strict=False)]
+            halves = zip(*((c[:m], c[m:]) for c, m in zip(columns, middle, strict=True)), strict=True)
+            out[name] = np.concatenate([half for side in halves for half in side]).astype(columns[0].dtype)
+        return cls(collision=banks[0].collision, **out)
+
     def save(self, path: Path | str) -> None:
         """Write one .npz file, complete or not at all."""
         _save(path, "scenes", {f.name: getattr(self, f.name) for f in fields(self)})
@@ -152,6 +175,18 @@ class ViewBank:
         kept = self.select(new[self.scene] >= 0)
         return ViewBank(**{**{f.name: getattr(kept, f.name) for f in fields(kept)}, "scene": new[kept.scene]})
 
+    @classmethod
+    def joined(cls, banks: Sequence[ViewBank], scenes: Sequence[int]) -> ViewBank:
+        """One bank of the views of several, whose Scenes number `scenes`, to match `SceneBank.joined`.
+
+        Raises ValueError where the views have different numbers of points or contacts.
+        """
+        if len(sizes := {(bank.points.shape[1], bank.contacts.shape[1]) for bank in banks}) > 1:
+            raise ValueError(f"their views differ in points and contacts {sorted(sizes)}")
+        out = {f.name: np.concatenate([getattr(bank, f.name) for bank in banks]) for f in fields(cls)}
+        out["scene"] = out["scene"] + np.repeat(np.cumsum([0, *scenes[:-1]]), [len(b) for b in banks]).astype(np.int32)
+        return cls(**out)
+
     def save(self, path: Path | str) -> None:
         """Write one .npz file, complete or not at all."""
         _save(path, "views", {f.name: getattr(self, f.name) for f in fields(self)})
@@ -182,6 +217,11 @@ class Scenes:
         return cls(
             jnp.asarray(category, jnp.int32), as_f32(bank.part_pos), as_f32(axis), as_f32(bank.width), len(names)
         )
+
+
+def _starts(starts: Iterable[np.ndarray]) -> np.ndarray:
+    """Where the rows of several tables begin when they follow each other, from where they begin in each of them."""
+    return np.concatenate([[0], *(np.diff(start) for start in starts)]).cumsum().astype(np.int32)
 
 
 def _save(path: Path | str, kind: str, arrays: dict[str, np.ndarray | str]) -> None:

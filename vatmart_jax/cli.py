@@ -131,6 +131,8 @@ def _train(argv: list[str]) -> None:
         """run folder"""
         data: Path | None = None
         """a folder of objects, or what `vatmart convert` made of it; default the bundled objects"""
+        more_data: tuple[Path, ...] = ()
+        """further folders such as those of `vatmart generate`, whose training splits are trained on too"""
         preset: str = chosen
         """quick, cpu, gpu or paper; the flags below start from it; default quick for the bundled objects, and with
         --data gpu on a GPU, else cpu"""
@@ -142,17 +144,22 @@ def _train(argv: list[str]) -> None:
 
     args = tyro.cli(Train, args=argv, prog="vatmart train")
     _enable_compilation_cache()
+    from vatmart_jax.data import Data
     from vatmart_jax.physics.interface import default_impl
     from vatmart_jax.pipeline.run import check_folder
     from vatmart_jax.progress import Bars
     from vatmart_jax.training import resolve, train
 
-    config = resolve(args.task, args.preset, args.impl or default_impl(), args.seed, args.settings, args.data)
+    if args.more_data and args.data is None:
+        raise UserError("--more-data without --data: name what it adds to")
+    config = resolve(
+        args.task, args.preset, args.impl or default_impl(), args.seed, args.settings, args.data, args.more_data
+    )
     check_folder(args.out, config)
     with Bars() as bars:
         points = args.settings.perception.networks.pointnet.n_points
-        folder = _prepared(args.data, bars.say, points)
-        result, table = train(config, args.settings, folder, args.out, bars)
+        data = Data(*(_prepared(folder, bars.say, points) for folder in (args.data, *args.more_data)))
+        result, table = train(config, args.settings, data, args.out, bars)
     _print_result(result, args.json, table)
 
 

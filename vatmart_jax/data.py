@@ -70,13 +70,19 @@ def prepare(
 
 
 class Data:
-    """The banks of one converted folder."""
+    """The banks of one converted folder, and the training splits of more of them."""
 
-    def __init__(self, folder: Path):
-        """Raises BankError where the banks are missing or damaged."""
+    def __init__(self, folder: Path, *more: Path):
+        """Raises BankError where the banks are missing or damaged, DataError where they cannot be joined."""
         self.folder = folder
-        self._scenes = SceneBank.load(folder / "scenes.npz")
-        self._views = ViewBank.load(folder / "views.npz")
+        found = [_banks(folder), *(_banks(other, SPLITS[0]) for other in more)]
+        scenes, views = zip(*found, strict=True)
+        try:
+            self._scenes = SceneBank.joined(scenes)
+            self._views = ViewBank.joined(views, [len(bank) for bank in scenes])
+        except ValueError as e:
+            folders = ", ".join(map(str, (folder, *more)))
+            raise DataError(f"{folders}: cannot be trained on together: {e}; convert them with the same flags") from e
 
     def env(self, split: str, task: Task, impl: str, config: EnvConfig, physics: PhysicsConfig) -> Env:
         """The environment of one split. Raises DataError where the split has nothing for the task."""
@@ -87,3 +93,12 @@ class Data:
             return Env(self._scenes.select(chosen), self._views.of_scenes(chosen), task, impl, config, physics)
         except ValueError as e:
             raise DataError(f"{self.folder}, split {split}: {e}") from e
+
+
+def _banks(folder: Path, split: str | None = None) -> tuple[SceneBank, ViewBank]:
+    """A converted folder's banks, or what they have of one split."""
+    scenes, views = SceneBank.load(folder / "scenes.npz"), ViewBank.load(folder / "views.npz")
+    if split is None:
+        return scenes, views
+    chosen = np.flatnonzero(scenes.split == split)
+    return scenes.select(chosen), views.of_scenes(chosen)

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field, replace
 import jax
 
 from vatmart_jax.env import EnvConfig
+from vatmart_jax.errors import UserError
 from vatmart_jax.perception.networks import NetworksConfig
 from vatmart_jax.perception.pointnet2 import SMALL
 from vatmart_jax.perception.train import PerceptionConfig
@@ -46,6 +47,14 @@ class Schedule:
     finetune_steps: int = 400
     finetune_rate: float = 1e-3
     """learning rate of curiosity and finetune rounds"""
+    members: int = 1
+    """the networks after the last so many finetune rounds are the priors, together: each forgets other objects"""
+
+    def __post_init__(self) -> None:
+        if not 1 <= self.members <= max(self.finetune, 1):
+            raise UserError(
+                f"--schedule.members {self.members}: expected 1 to the number of finetune rounds, {self.finetune}"
+            )
 
 
 @dataclass(frozen=True)

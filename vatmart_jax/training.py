@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -28,7 +29,9 @@ from vatmart_jax.presets import Settings
 _PICTURES = 6
 
 
-def resolve(task: str, preset: str, impl: str, seed: int, settings: Settings, data: Path | None) -> dict[str, Any]:
+def resolve(
+    task: str, preset: str, impl: str, seed: int, settings: Settings, data: Path | None, more_data: Sequence[Path] = ()
+) -> dict[str, Any]:
     """The config that is written beside every result. Raises UserError for an unknown task or impl."""
     one_of("--task", task, TASKS)
     one_of("--impl", impl, IMPLS)
@@ -36,6 +39,7 @@ def resolve(task: str, preset: str, impl: str, seed: int, settings: Settings, da
         "version": __version__,
         "task": task,
         "data": None if data is None else str(data.resolve()),
+        "more_data": [str(folder.resolve()) for folder in more_data],
         "preset": preset,
         "impl": impl,
         "seed": seed,
@@ -44,23 +48,20 @@ def resolve(task: str, preset: str, impl: str, seed: int, settings: Settings, da
 
 
 def train(
-    config: dict[str, Any], settings: Settings, folder: Path, out: Path, report: Report
+    config: dict[str, Any], settings: Settings, data: Data, out: Path, report: Report
 ) -> tuple[dict[str, Any], str]:
     """Train, evaluate and draw what is left of a run; returns result.json's content and the table.
 
-    config: of `resolve`; folder: the converted data. Raises UserError where the data does not fit the task or `out`
-    holds something else.
+    config: of `resolve`. Raises UserError where the data does not fit the task or `out` holds something else.
     """
     begun = time.monotonic()
     task = TASKS[config["task"]]
-    data = Data(folder)
     envs = environments(data, task, config["impl"], settings)
-    networks, copies = perception_config(settings, task).networks, settings.evaluation.copies
-    described = PriorsConfig(task.name, task.low, task.high, networks, copies)  # refused before anything is written
+    described = priors_config(settings, task)  # refused before anything is written
     with Run(out, config) as run:
         training = Training(run, envs["train"], settings, config["seed"], report)
         progress = training.train()
-        priors = Priors(described, progress.perception.params)
+        priors = Priors(described, progress.params)
         priors.save(out / "priors")
         write_bytes(out / "policy.msgpack", serialization.to_bytes(jax.device_get(progress.explore.td3.policy)))
         tests = {split: env for split, env in envs.items() if split != "train"}
@@ -74,7 +75,7 @@ def train(
         seconds = run_seconds(progress) | {"evaluate": round(time.monotonic() - evaluated, 1)}
         table = markdown([{"task": task.name, **row} for row in results])
         pictures.curves(read_metrics(out), out / "curves.png")
-        pictures.contact_sheet([folder / i / "picture.png" for i in _objects(envs)], out / "objects.png")
+        pictures.contact_sheet([data.folder / i / "picture.png" for i in _objects(envs)], out / "objects.png")
         shown = next(iter(tests.values()), envs["train"])
         draw_priors(priors, shown, training.key("pictures"), out)
         ours = {row["split"]: row["success"] for row in results if row["method"] == "ours"}
@@ -89,6 +90,12 @@ def train(
         }
         write_json(out / "result.json", result)
     return result, table
+
+
+def priors_config(settings: Settings, task: Task) -> PriorsConfig:
+    """What a run with these settings makes priors of. Raises UserError for settings that make none."""
+    networks = perception_config(settings, task).networks
+    return PriorsConfig(task.name, task.low, task.high, networks, settings.evaluation.copies, settings.schedule.members)
 
 
 def environments(data: Data, task: Task, impl: str, settings: Settings) -> dict[str, Env]:

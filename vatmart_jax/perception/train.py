@@ -162,8 +162,7 @@ class Index(NamedTuple):
     rows: jax.Array  # [M] int32, rows sorted by view and kind, empty ones last
     start: jax.Array  # [V, 2] int32, where a view's rows of either kind begin
     count: jax.Array  # [V, 2] int32
-    filled: jax.Array  # [V] int32, views with rows first
-    n_filled: jax.Array  # [] int32
+    total: jax.Array  # [] int32, rows that are not empty
 
 
 class Batch(NamedTuple):
@@ -203,7 +202,7 @@ def train(
     `steps_per_call` steps. Returns the state with its step back at 0. Raises ValueError where there are no samples.
     """
     index = _index(samples, len(clouds))
-    if int(index.n_filled) == 0:
+    if int(index.total) == 0:
         raise ValueError(f"nothing to train the {stage} stage on: the buffer has no samples")
     if config.networks.course and clouds.joints is None:
         raise ValueError("the networks' course has nothing to learn from: the clouds come without joints")
@@ -224,18 +223,17 @@ def _index(samples: Samples, n_views: int) -> Index:
     count = jnp.zeros(2 * n_views + 1, jnp.int32).at[place].add(1)
     start = jnp.cumsum(count) - count
     start, count = (a[:-1].reshape(n_views, 2) for a in (start, count))
-    empty = count.sum(-1) == 0
-    return Index(jnp.argsort(place).astype(jnp.int32), start, count, jnp.argsort(empty), jnp.sum(~empty))
+    return Index(jnp.argsort(place).astype(jnp.int32), start, count, count.sum())
 
 
 def _draw(key: jax.Array, clouds: Clouds, samples: Samples, index: Index, config: PerceptionConfig) -> Batch:
-    """Views with samples, uniformly, and samples of both kinds of each, uniformly and with replacement.
+    """Views, as often as trials were made in them, and samples of both kinds of each, uniformly and with replacement.
 
-    Consumes the key.
+    Trials are balanced over categories and objects, so views are. Consumes the key.
     """
     k_view, k_kind, k_row, k_task, k_probe, k_augment = jax.random.split(key, 6)
     shape = (config.views, config.queries)
-    view = index.filled[jax.random.randint(k_view, (config.views,), 0, index.n_filled)]
+    view = samples.view[index.rows[jax.random.randint(k_view, (config.views,), 0, index.total)]]
     count = index.count[view][:, None]
     proposed = jax.random.bernoulli(k_kind, config.proposed, shape)
     kind = jnp.where((count > 0).all(-1), proposed, count[..., 1] > 0).astype(jnp.int32)
