@@ -163,3 +163,35 @@ def test_a_save_that_fails_leaves_the_old_file_and_nothing_else(cabinets, tmp_pa
         replace(cabinets[1], scene=unwritable).save(path)
     assert_same(ViewBank.load(path), cabinets[1])
     assert [p.name for p in tmp_path.iterdir()] == ["views.npz"]
+
+
+@pytest.mark.parametrize("convert", [lambda bank: bank, as_boxes], ids=["hull", "box"])
+def test_joined_banks_hold_the_scenes_and_views_of_each(cabinets, convert):
+    bank, views = convert(cabinets[0]), cabinets[1]
+    halves = np.array([4, 1, 0]), np.array([5, 2, 3])
+    banks = [bank.select(half) for half in halves]
+    order = np.concatenate(halves)
+    joined = SceneBank.joined(banks)
+    together = joined.select(np.arange(len(order)))
+    if bank.collision == "hull":
+        for new, old in enumerate(order):
+            for was, now in zip(solids(bank, old), solids(joined, new), strict=True):
+                np.testing.assert_array_equal(now, was)
+    else:
+        rows = lambda b, s: b.box_size[b.instance_shape[b.static_start[s] : b.static_start[s + 1]]]  # noqa: E731
+        for new, old in enumerate(order):
+            np.testing.assert_array_equal(rows(joined, new), rows(bank, old))
+    assert_same(together, joined)  # every shape is used, once
+    assert_same(SceneBank.joined([bank]), bank)
+    found = ViewBank.joined([views.of_scenes(half) for half in halves], [len(half) for half in halves])
+    assert len(found) == len(views)
+    np.testing.assert_array_equal(np.sort(order[found.scene]), np.sort(views.scene))
+    np.testing.assert_array_equal(found.points[0], views.points[views.scene == np.min(halves[0])][0])
+
+
+def test_banks_that_do_not_fit_are_not_joined(cabinets):
+    bank, views = cabinets
+    with pytest.raises(ValueError, match=r"collision geometry differs \(box, hull\)"):
+        SceneBank.joined([bank, as_boxes(bank)])
+    with pytest.raises(ValueError, match="views differ in points and contacts"):
+        ViewBank.joined([views, replace(views, points=views.points[:, :10])], [6, 6])

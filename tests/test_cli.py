@@ -133,6 +133,12 @@ def test_data_that_is_no_data_is_refused(tmp_path, capsys):
     assert not out.exists()
 
 
+def test_more_data_adds_to_something(tmp_path, capsys):
+    arguments = ("train", "--task", "push-door", "--more-data", str(tmp_path), "--out", str(tmp_path / "run"))
+    assert "--more-data without --data" in refused(capsys, *arguments)
+    assert not (tmp_path / "run").exists()
+
+
 def test_a_damaged_bank_is_refused(tmp_path, capsys):
     (tmp_path / "data").mkdir()
     (tmp_path / "data" / "scenes.npz").write_bytes(b"PK\x03\x04 cut")

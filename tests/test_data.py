@@ -1,10 +1,16 @@
-"""Preparing data: of several runs that start at once, one converts and the others wait."""
+"""Data: of several runs that prepare it at once one converts and the others wait; what more folders add."""
 
 import threading
 import time
+from dataclasses import replace
 from pathlib import Path
 
-from vatmart_jax.data import prepare
+import numpy as np
+import pytest
+
+from vatmart_jax.data import SPLITS, Data, DataError, prepare
+from vatmart_jax.env import TASKS, EnvConfig
+from vatmart_jax.physics import PhysicsConfig
 
 
 def test_runs_that_start_at_once_prepare_one_after_the_other(tmp_path, monkeypatch):
@@ -28,3 +34,22 @@ def test_runs_that_start_at_once_prepare_one_after_the_other(tmp_path, monkeypat
         thread.join()
     assert most == 1 and len(found) == 4 and len(set(found)) == 1
     assert len(said) == 3 and all("waiting for another run" in line for line in said)
+
+
+def test_more_folders_add_their_training_splits_and_nothing_else(cabinets, tmp_path):
+    bank, views = cabinets
+    renamed = replace(bank, object_id=np.array([f"more-{i}" for i in bank.object_id]))
+    for folder, scenes in (("own", bank), ("more", renamed)):
+        (tmp_path / folder).mkdir()
+        scenes.save(tmp_path / folder / "scenes.npz")
+        views.save(tmp_path / folder / "views.npz")
+    folders = tmp_path / "own", tmp_path / "more"
+    found = {}
+    for name, data in (("one", Data(folders[0])), ("both", Data(*folders))):
+        envs = (data.env(split, TASKS["push-drawer"], "c", EnvConfig(batch=4), PhysicsConfig()) for split in SPLITS)
+        found[name] = [env.bank.object_id.tolist() for env in envs]
+    assert found["both"][0] == found["one"][0] + [f"more-{i}" for i in found["one"][0]]
+    assert found["both"][1:] == found["one"][1:]
+    replace(views, points=views.points[:, :10]).save(tmp_path / "more" / "views.npz")
+    with pytest.raises(DataError, match=r"own, .*more: cannot be trained on together: their views differ"):
+        Data(*folders)

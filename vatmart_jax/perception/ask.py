@@ -66,7 +66,7 @@ class Ensemble:
     def propose(
         self, params: Params, f: Features, contact: jax.Array, task: jax.Array, key: jax.Array, count: int
     ) -> tuple[jax.Array, jax.Array]:
-        """Trajectories [..., count, 30] for the view as it is, of every member as many, and their scores [..., count].
+        """Trajectories [..., count, 30] for the view as it is, of the members by turns, and their scores.
 
         Contacts [..., 3] and tasks [...]. Those made for the copies and brought back succeed less (docs/learning.md).
         Consumes the key.
