@@ -90,7 +90,7 @@ def test_the_priors_are_the_networks_of_the_last_rounds(finished, converted):
     for stacked, last in zip(jax.tree.leaves(priors.params), jax.tree.leaves(progress.perception.params), strict=True):
         np.testing.assert_array_equal(stacked[0], last)
     assert any((stacked[0] != stacked[1]).any() for stacked in jax.tree.leaves(priors.params))
-    with pytest.raises(UserError, match=r"--schedule\.members 3: expected 1 to 2"):
+    with pytest.raises(UserError, match=r"--schedule\.members 3: expected 1 to the number of finetune rounds, 2"):
         replace(TINY.schedule, members=3)
 
 
