@@ -95,8 +95,9 @@ PRESETS = {
         ),
         schedule=Schedule(
             samples=400_000, collect=128, course=6000, scorer=200, proposal=2000, actionability=200, finetune=16,
-            finetune_batches=64, finetune_steps=1500,
+            finetune_batches=64, finetune_steps=1500, members=4,
         ),
+        evaluation=EvaluationConfig(copies=2),
     ),
     "gpu": Settings(
         env=EnvConfig(batch=4096),
@@ -104,8 +105,9 @@ PRESETS = {
         perception=PerceptionConfig(networks=NetworksConfig(course=(128, 128), hinge=True), views=32),
         schedule=Schedule(
             samples=2_000_000, collect=100, course=3000, scorer=10_000, proposal=10_000, actionability=3000,
-            curiosity=30, curiosity_steps=200, finetune=10, finetune_batches=20, finetune_steps=3000,
+            curiosity=30, curiosity_steps=200, finetune=10, finetune_batches=20, finetune_steps=3000, members=4,
         ),
+        evaluation=EvaluationConfig(copies=2),
     ),
     # The paper's numbers where it gives them (appendix A, B): 5,000 episodes and 5,000 + 5,000 trajectories.
     "paper": Settings(
