@@ -86,7 +86,7 @@ def main(args: Study) -> None:
                     stage=jnp.int32(STAGES.index("course")),
                 )  # fmt: skip
                 progress = training.train(begun)
-            priors = Priors(priors_config(own, task), progress.params)
+            priors = Priors(priors_config(own, task), progress.perception.params)
             rows = []
             for number, (split, env) in enumerate(envs.items()):
                 key = jax.random.fold_in(jax.random.key(args.seed), number)

@@ -1,7 +1,6 @@
 """Priors: what is saved is what is loaded; damaged folders and wrong input are refused in one line."""
 
 import json
-from dataclasses import replace
 from pathlib import Path
 
 import jax
@@ -14,7 +13,6 @@ from jax import export as jax_export
 from vatmart_jax.cli import main
 from vatmart_jax.errors import UserError
 from vatmart_jax.export import export
-from vatmart_jax.files import write_json
 from vatmart_jax.inference import Priors, PriorsConfig, PriorsError, amount, read_cloud, read_mask
 from vatmart_jax.perception.networks import Networks, NetworksConfig
 from vatmart_jax.perception.pointnet2 import Level, PointNetConfig
@@ -42,22 +40,6 @@ def test_loaded_priors_predict_what_the_saved_ones_do(priors: Priors, points: np
     key = jax.random.key(1)
     for a, b in zip(priors.predict(points, 0.3, key=key), loaded.predict(points, 0.3, key=key), strict=True):
         np.testing.assert_array_equal(a, b)
-
-
-def test_priors_of_several_networks_come_back_and_others_are_refused(
-    priors: Priors, points: np.ndarray, tmp_path: Path
-) -> None:
-    params = jax.tree.map(lambda a: np.stack([a, 0.9 * a]), jax.device_get(priors.params))
-    two = Priors(replace(priors.config, members=2, copies=2), params)
-    two.save(tmp_path)
-    found, expected = Priors.load(tmp_path).predict(points, 0.3), two.predict(points, 0.3)
-    for a, b in zip(found, expected, strict=True):
-        np.testing.assert_array_equal(a, b)
-    assert not np.allclose(found.actionability, priors.predict(points, 0.3).actionability)
-    for members in (1, 3):
-        write_json(tmp_path / "config.json", json.loads((tmp_path / "config.json").read_text()) | {"members": members})
-        with pytest.raises(PriorsError, match="does not belong to"):
-            Priors.load(tmp_path)
 
 
 def test_a_prediction_has_the_promised_shapes_and_order(priors: Priors, points: np.ndarray) -> None:

@@ -279,33 +279,6 @@ def test_an_ensemble_says_the_mean_over_copies_of_what_it_proposes_for_the_view(
     close(said[2], ensemble.score(params, Features(*(x[:, 2, None] for x in f)), contact[2], task[2], proposed[2]))
 
 
-def test_members_answer_together_and_propose_by_turns(world, data) -> None:
-    clouds, networks = world[0], Networks(COURSE.networks)
-    each = [t.begin(jax.random.key(seed), COURSE).params for seed in range(3)]
-    stacked = jax.tree.map(lambda *a: jnp.stack(a), *each)
-    ensemble = Ensemble(networks, copies=2, members=3)
-    points, grouping = jax.tree.map(lambda a: a[0], (clouds.points, clouds.grouping))
-    contact, task, which = clouds.contacts[0, :4], jnp.linspace(0.1, 0.4, 4), jnp.arange(4)
-    f = jax.jit(ensemble.features)(stacked, points, grouping, which)
-    alone, one = [], Ensemble(networks, copies=2)
-    for params in each:
-        own = jax.jit(one.features)(params, points, grouping, which)
-        score = one.score(params, own, contact, task, data.trajectory[:4])
-        alone.append((own, score, one.actionability(params, own, contact, task)))
-    close = partial(np.testing.assert_allclose, rtol=2e-3, atol=2e-4)
-    close(ensemble.score(stacked, f, contact, task, data.trajectory[:4]), sum(a[1] for a in alone) / 3)
-    close(ensemble.actionability(stacked, f, contact, task), sum(a[2] for a in alone) / 3)
-    proposed, said = ensemble.propose(stacked, f, contact, task, jax.random.key(1), 8)
-    assert proposed.shape == (4, 8, 30)
-    z = jax.random.normal(jax.random.key(1), (3, 3, COURSE.networks.latent_dim))
-    for member in range(3):
-        itself = Features(*(x[0][:, None] for x in alone[member][0]))
-        expected = networks.propose(each[member], itself, contact[:, None], task[:, None], z[member])
-        close(proposed[:, member::3], expected[:, : 3 if member < 2 else 2])
-    at = Features(*(x[:, 2, None] for x in f))
-    close(said[2], ensemble.score(stacked, at, contact[2], task[2], proposed[2]))
-
-
 def test_disturbed_courses_are_off_by_the_share_asked_for() -> None:
     places = jnp.array([[0.1, 0, 0], [0.2, 0, 0], [0.3, 0, 0], [0.4, 0, 0]])
     course = jnp.broadcast_to(pack_course(places, jnp.array([0.0, 0, 0.5])), (8, 500, 15))

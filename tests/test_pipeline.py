@@ -13,14 +13,13 @@ from vatmart_jax.data import Data
 from vatmart_jax.env import TASKS, EnvConfig
 from vatmart_jax.errors import UserError
 from vatmart_jax.evaluation.evaluate import METRICS, evaluate
-from vatmart_jax.inference import Priors
 from vatmart_jax.perception.networks import NetworksConfig
 from vatmart_jax.perception.pointnet2 import Level, PointNetConfig
 from vatmart_jax.perception.train import PerceptionConfig
 from vatmart_jax.physics import PhysicsConfig
 from vatmart_jax.pipeline.explore import ExploreConfig
 from vatmart_jax.pipeline.run import Run, RunError, read_metrics
-from vatmart_jax.pipeline.train import Training, perception_config
+from vatmart_jax.pipeline.train import perception_config
 from vatmart_jax.presets import PRESETS, EvaluationConfig, Schedule, Settings, default_preset
 from vatmart_jax.rl.td3 import TD3Config
 from vatmart_jax.training import resolve, train
@@ -38,7 +37,7 @@ TINY = Settings(
     ),
     schedule=Schedule(
         samples=512, collect=2, course=3, scorer=6, proposal=6, actionability=3, curiosity=2, curiosity_iterations=1,
-        curiosity_steps=3, finetune=2, finetune_batches=1, finetune_steps=3, members=2,
+        curiosity_steps=3, finetune=1, finetune_batches=1, finetune_steps=3,
     ),
     evaluation=EvaluationConfig(trials=24, proposals=4, copies=2),
 )  # fmt: skip
@@ -76,22 +75,6 @@ def test_a_run_leaves_everything_its_readers_need(finished):
     assert list(dict.fromkeys(stages)) == [
         "explore", "collect", "course", "scorer", "proposal", "actionability", "curiosity", "finetune",
     ]  # fmt: skip
-
-
-def test_the_priors_are_the_networks_of_the_last_rounds(finished, converted):
-    out, _ = finished
-    data = Data(converted)
-    config = json.loads((out / "config.json").read_text())
-    env = data.env("train", TASKS["push-drawer"], "c", TINY.env, TINY.physics)
-    with Run(out, config) as opened:
-        progress = Training(opened, env, TINY, 0, lambda *_: None).train()  # all of it is done
-    priors = Priors.load(out)
-    assert priors.config.members == 2
-    for stacked, last in zip(jax.tree.leaves(priors.params), jax.tree.leaves(progress.perception.params), strict=True):
-        np.testing.assert_array_equal(stacked[0], last)
-    assert any((stacked[0] != stacked[1]).any() for stacked in jax.tree.leaves(priors.params))
-    with pytest.raises(UserError, match=r"--schedule\.members 3: expected 1 to the number of finetune rounds, 2"):
-        replace(TINY.schedule, members=3)
 
 
 def test_an_evaluation_has_the_priors_the_trials_the_policy_and_what_the_scores_were_worth(finished, tmp_path):

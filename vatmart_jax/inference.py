@@ -29,7 +29,7 @@ from vatmart_jax.perception.networks import Features, Networks, NetworksConfig, 
 from vatmart_jax.perception.pointnet2 import group
 
 FORMAT = 1
-MOST_COPIES = 64  # of a view, and as many networks: a config is untrusted, and memory grows with them
+MOST_COPIES = 64  # of a view: a config is untrusted, and memory grows with them
 
 
 class PriorsError(UserError):
@@ -49,13 +49,10 @@ class PriorsConfig:
     networks: NetworksConfig = field(default_factory=NetworksConfig)
     copies: int = 1
     """of a view, mirrored and turned, that the networks are asked about; 1: the view alone"""
-    members: int = 1
-    """networks whose answers are averaged; their parameters are stacked where there are several"""
 
     def __post_init__(self) -> None:
-        for name in ("copies", "members"):
-            if not 1 <= getattr(self, name) <= MOST_COPIES:
-                raise UserError(f"{name} {getattr(self, name)}: expected 1 to {MOST_COPIES}")
+        if not 1 <= self.copies <= MOST_COPIES:
+            raise UserError(f"copies {self.copies}: expected 1 to {MOST_COPIES}")
 
 
 class Prediction(NamedTuple):
@@ -83,7 +80,7 @@ class Priors:
     @property
     def ensemble(self) -> Ensemble:
         """The networks as they are to be asked."""
-        return Ensemble(Networks(self.config.networks), self.config.copies, self.config.members)
+        return Ensemble(Networks(self.config.networks), self.config.copies)
 
     def save(self, path: Path | str) -> None:
         """Write the folder, complete or not at all; one that is there is replaced."""
@@ -105,11 +102,7 @@ class Priors:
             params: Any = serialization.msgpack_restore(file.read_bytes())
         except Exception as e:  # whatever msgpack and NumPy raise on damaged bytes
             raise PriorsError(f"{file}: cannot be read ({first_line(e)}); train or export the priors again") from e
-        init: Any = Networks(config.networks).init
-        key = jax.random.key(0)
-        if config.members > 1:
-            init, key = jax.vmap(init), jax.random.split(key, config.members)
-        expected = jax.eval_shape(init, key)
+        expected = jax.eval_shape(Networks(config.networks).init, jax.random.key(0))
         wrong = _difference(expected, params)
         if wrong:
             raise PriorsError(f"{file}: {wrong}; it does not belong to {path / 'config.json'}, export the priors again")

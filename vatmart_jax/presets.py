@@ -7,7 +7,6 @@ from dataclasses import dataclass, field, replace
 import jax
 
 from vatmart_jax.env import EnvConfig
-from vatmart_jax.errors import UserError
 from vatmart_jax.perception.networks import NetworksConfig
 from vatmart_jax.perception.pointnet2 import SMALL
 from vatmart_jax.perception.train import PerceptionConfig
@@ -47,14 +46,6 @@ class Schedule:
     finetune_steps: int = 400
     finetune_rate: float = 1e-3
     """learning rate of curiosity and finetune rounds"""
-    members: int = 1
-    """the networks after the last so many finetune rounds are the priors, together: each forgets other objects"""
-
-    def __post_init__(self) -> None:
-        if not 1 <= self.members <= max(self.finetune, 1):
-            raise UserError(
-                f"--schedule.members {self.members}: expected 1 to the number of finetune rounds, {self.finetune}"
-            )
 
 
 @dataclass(frozen=True)
@@ -95,9 +86,8 @@ PRESETS = {
         ),
         schedule=Schedule(
             samples=400_000, collect=128, course=6000, scorer=200, proposal=2000, actionability=200, finetune=16,
-            finetune_batches=64, finetune_steps=1500, members=4,
+            finetune_batches=64, finetune_steps=1500,
         ),
-        evaluation=EvaluationConfig(copies=2),
     ),
     "gpu": Settings(
         env=EnvConfig(batch=4096),
@@ -105,9 +95,8 @@ PRESETS = {
         perception=PerceptionConfig(networks=NetworksConfig(course=(128, 128), hinge=True), views=32),
         schedule=Schedule(
             samples=2_000_000, collect=100, course=3000, scorer=10_000, proposal=10_000, actionability=3000,
-            curiosity=30, curiosity_steps=200, finetune=10, finetune_batches=20, finetune_steps=3000, members=4,
+            curiosity=30, curiosity_steps=200, finetune=10, finetune_batches=20, finetune_steps=3000,
         ),
-        evaluation=EvaluationConfig(copies=2),
     ),
     # The paper's numbers where it gives them (appendix A, B): 5,000 episodes and 5,000 + 5,000 trajectories.
     "paper": Settings(

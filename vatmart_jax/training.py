@@ -61,7 +61,7 @@ def train(
     with Run(out, config) as run:
         training = Training(run, envs["train"], settings, config["seed"], report)
         progress = training.train()
-        priors = Priors(described, progress.params)
+        priors = Priors(described, progress.perception.params)
         priors.save(out / "priors")
         write_bytes(out / "policy.msgpack", serialization.to_bytes(jax.device_get(progress.explore.td3.policy)))
         tests = {split: env for split, env in envs.items() if split != "train"}
@@ -95,7 +95,7 @@ def train(
 def priors_config(settings: Settings, task: Task) -> PriorsConfig:
     """What a run with these settings makes priors of. Raises UserError for settings that make none."""
     networks = perception_config(settings, task).networks
-    return PriorsConfig(task.name, task.low, task.high, networks, settings.evaluation.copies, settings.schedule.members)
+    return PriorsConfig(task.name, task.low, task.high, networks, settings.evaluation.copies)
 
 
 def environments(data: Data, task: Task, impl: str, settings: Settings) -> dict[str, Env]:

@@ -1,7 +1,6 @@
 """What trained networks say of views: where to act, how, and how likely that is to do the task.
 
-An `Ensemble` asks several networks about a view and about mirrored and turned copies of it; the scores it gives are
-means.
+An `Ensemble` asks them about a view and about mirrored and turned copies of it; the scores it gives are means.
 """
 
 from __future__ import annotations
@@ -22,73 +21,55 @@ from vatmart_jax.perception.transform import Transform, spread
 
 @dataclass(frozen=True)
 class Ensemble:
-    """`members` networks of the same kind, each asked about `copies` of a view (1: the view alone).
+    """The networks, asked about `copies` of a view (1: the view alone).
 
-    Parameters are those of one network or, where there are several, stacked along a leading dimension. Heads broadcast
-    as those of `Networks` do, with features that carry a leading dimension for the answers of every member about every
-    copy; contacts and trajectories are those of the view as it is.
+    Heads broadcast as those of `Networks` do, with features that carry a leading dimension for the copies; contacts
+    and trajectories are those of the view as it is.
     """
 
     networks: Networks
     copies: int = 1
-    members: int = 1
 
     def features(
         self, params: Params, points: jax.Array, grouping: Grouping, which: jax.Array | None = None
     ) -> Features:
-        """Features [members * copies, Q, F] of one view: points [N, 3], which [Q] int into the grouping's queries
-        (None: all)."""
+        """Features [copies, Q, F] of one view: points [N, 3], which [Q] int into the grouping's queries (None: all)."""
 
-        def answer(member: Params, transform: Transform) -> Features:
+        def of_copy(transform: Transform) -> Features:
             queries = transform.points(grouping.queries)
-            return self.networks.features(member, transform.points(points), grouping.replace(queries=queries), which)
+            return self.networks.features(params, transform.points(points), grouping.replace(queries=queries), which)
 
-        # By turns: the groups of one copy fill the caches.
-        of_member = lambda member: jax.lax.map(partial(answer, member), spread(self.copies))  # noqa: E731
-        if self.members == 1:
-            return of_member(params)
-        return jax.tree.map(lambda a: a.reshape(-1, *a.shape[2:]), jax.lax.map(of_member, params))
+        return jax.lax.map(of_copy, spread(self.copies))  # by turns: the groups of one copy fill the caches
 
     def actionability(self, params: Params, f: Features, contact: jax.Array, task: jax.Array) -> jax.Array:
         """Actionability [...] as a probability."""
-        return self._mean(lambda p, t, f: self.networks.actionability(p, f, t.points(contact), task), params, f)
+        of_copy = lambda t, f: jax.nn.sigmoid(self.networks.actionability(params, f, t.points(contact), task))  # noqa: E731
+        return jax.vmap(of_copy)(spread(self.copies), f).mean(0)
 
     def score(
         self, params: Params, f: Features, contact: jax.Array, task: jax.Array, trajectory: jax.Array
     ) -> jax.Array:
         """Probability [...] that the trajectory does the task."""
 
-        def logit(params: Params, transform: Transform, f: Features) -> jax.Array:
-            return self.networks.score(params, f, transform.points(contact), task, transform.trajectory(trajectory))
+        def of_copy(transform: Transform, f: Features) -> jax.Array:
+            asked = transform.points(contact), task, transform.trajectory(trajectory)
+            return jax.nn.sigmoid(self.networks.score(params, f, *asked))
 
-        return self._mean(logit, params, f)
+        return jax.vmap(of_copy)(spread(self.copies), f).mean(0)
 
     def propose(
         self, params: Params, f: Features, contact: jax.Array, task: jax.Array, key: jax.Array, count: int
     ) -> tuple[jax.Array, jax.Array]:
-        """Trajectories [..., count, 30] for the view as it is, of the members by turns, and their scores.
+        """Trajectories [..., count, 30] for the view as it is, and their scores [..., count].
 
         Contacts [..., 3] and tasks [...]. Those made for the copies and brought back succeed less (docs/learning.md).
         Consumes the key.
         """
-        each = -(-count // self.members)
-        z = jax.random.normal(key, (self.members, each, self.networks.config.latent_dim))
-        contact, task = contact[..., None, :], task[..., None]
-        f = Features(*(x[..., None, :] for x in f))
-        itself = Features(*(x[:: self.copies] for x in f))
-        of_member = lambda p, f, z: self.networks.propose(p, f, contact, task, z)  # noqa: E731
-        proposed = jax.vmap(of_member, (0 if self.members > 1 else None, 0, 0), -2)(params, itself, z)
-        proposed = proposed.reshape(*proposed.shape[:-3], -1, proposed.shape[-1])[..., :count, :]
-        return proposed, self.score(params, f, contact, task, proposed)
-
-    def _mean(self, logit: Callable[..., jax.Array], params: Params, f: Features) -> jax.Array:
-        """The mean probability [...] of all answers; logit: of a member's parameters, a transform and features."""
-        transforms = jax.tree.map(lambda a: jnp.tile(a, self.members), spread(self.copies))
-        axis = None
-        if self.members > 1:
-            axis, params = 0, jax.tree.map(lambda a: jnp.repeat(a, self.copies, 0), params)
-        probability = lambda *of_one: jax.nn.sigmoid(logit(*of_one))  # noqa: E731
-        return jax.vmap(probability, (axis, 0, 0))(params, transforms, f).mean(0)
+        lifted = Features(*(x[..., None, :] for x in f)), contact[..., None, :], task[..., None]
+        z = jax.random.normal(key, (count, self.networks.config.latent_dim))
+        itself = Features(*(x[0] for x in lifted[0]))
+        proposed = self.networks.propose(params, itself, *lifted[1:], z)
+        return proposed, self.score(params, *lifted, proposed)
 
 
 class Selection(NamedTuple):

@@ -18,7 +18,7 @@ from vatmart_jax.env import Env, Start, Task
 from vatmart_jax.perception import train as perception
 from vatmart_jax.perception.ask import Ensemble, score_trajectories
 from vatmart_jax.perception.clouds import Clouds, clouds_of, points_of
-from vatmart_jax.perception.networks import Networks, Params
+from vatmart_jax.perception.networks import Networks
 from vatmart_jax.perception.train import PerceptionConfig, PerceptionState, Samples
 from vatmart_jax.pipeline.collect import ProposalTrials, curious, samples_of
 from vatmart_jax.pipeline.explore import Explorer, ExploreState, start_pool
@@ -37,18 +37,11 @@ class Progress:
 
     explore: ExploreState
     perception: PerceptionState
-    members: Params  # [schedule.members, ...] the networks after the last rounds, the last one first
     samples: Samples
     stored: jax.Array  # [] int32, samples ever
     stage: jax.Array  # [] int32, index into STAGES
     done: jax.Array  # [] int32, units of that stage
     seconds: jax.Array  # [len(STAGES)] spent per stage, restarts included
-
-    @property
-    def params(self) -> Params:
-        """The priors' parameters, as `Ensemble` reads them: those of several networks stacked."""
-        one = len(jax.tree.leaves(self.members)[0]) == 1
-        return self.perception.params if one else self.members
 
     def with_samples(self, new: Samples) -> Progress:
         """Trials stored, in place of the oldest where the buffer is full."""
@@ -76,11 +69,9 @@ class Training:
 
     def beginning(self) -> Progress:
         """Nothing done yet."""
-        begun, members = perception.begin(self.key("networks"), self.config), self._settings.schedule.members
         return Progress(
             explore=self._explorer.init(self.key("policy")),
-            perception=begun,
-            members=jax.tree.map(lambda a: jnp.repeat(a[None], members, 0), begun.params),
+            perception=perception.begin(self.key("networks"), self.config),
             samples=Samples.empty(self._settings.schedule.samples),
             stored=jnp.int32(0),
             stage=jnp.int32(0),
@@ -234,9 +225,6 @@ class Training:
                 rates.append(float(found.success(self._env.config.tolerance)[chosen].mean()))
                 progress = progress.with_samples(found)
             progress, losses = self._round(progress, schedule.finetune_steps)
-            rolled = lambda new, old: jnp.concatenate([new[None], old[:-1]])  # noqa: E731
-            members = jax.tree.map(rolled, progress.perception.params, progress.members)
-            progress = progress.replace(members=members)
             metrics = {"success": float(np.mean(rates))} | losses
             progress = self._tick(progress, "finetune", done + 1, schedule.finetune, metrics)
         return progress
