@@ -41,6 +41,7 @@ class Study:
     run: Path
     """run folder of `vatmart train`"""
     data: Path
+    """what `vatmart convert` made, and the run was trained on"""
     variants: tuple[str, ...]
     out: Path
     trials: int = 350
@@ -66,7 +67,8 @@ def main(args: Study) -> None:
     described = read_config(args.run)
     settings = from_json(Settings, described["settings"])
     task = TASKS[described["task"]]
-    envs = environments(Data(args.data), task, default_impl(), settings)
+    data = Data(args.data, *map(Path, described["more_data"]))  # the run's trials name its views by number
+    envs = environments(data, task, default_impl(), settings)
     results = []
     with Bars() as bars:
         with Run(args.run, described) as run:

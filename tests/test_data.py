@@ -50,6 +50,11 @@ def test_more_folders_add_their_training_splits_and_nothing_else(cabinets, tmp_p
         found[name] = [env.bank.object_id.tolist() for env in envs]
     assert found["both"][0] == found["one"][0] + [f"more-{i}" for i in found["one"][0]]
     assert found["both"][1:] == found["one"][1:]
+    tested = found["one"][1][0]
+    replace(bank, object_id=np.full(len(bank), tested)).save(tmp_path / "more" / "scenes.npz")
+    with pytest.raises(DataError, match=f"more: would train on {tested}, which .*own has for the test"):
+        Data(*folders)
+    renamed.save(tmp_path / "more" / "scenes.npz")
     replace(views, points=views.points[:, :10]).save(tmp_path / "more" / "views.npz")
     with pytest.raises(DataError, match=r"own, .*more: cannot be trained on together: their views differ"):
         Data(*folders)

@@ -13,6 +13,7 @@ from vatmart_jax.data import Data
 from vatmart_jax.env import TASKS, EnvConfig
 from vatmart_jax.errors import UserError
 from vatmart_jax.evaluation.evaluate import METRICS, evaluate
+from vatmart_jax.inference import Priors
 from vatmart_jax.perception.networks import NetworksConfig
 from vatmart_jax.perception.pointnet2 import Level, PointNetConfig
 from vatmart_jax.perception.train import PerceptionConfig
@@ -75,6 +76,15 @@ def test_a_run_leaves_everything_its_readers_need(finished):
     assert list(dict.fromkeys(stages)) == [
         "explore", "collect", "course", "scorer", "proposal", "actionability", "curiosity", "finetune",
     ]  # fmt: skip
+
+
+def test_a_door_is_trained_with_its_hinge_from_data_to_priors(converted, tmp_path):
+    result, _ = run(converted, tmp_path / "run", "push-door")
+    assert set(result["success"]) == {"test_shapes", "test_categories"}
+    for line in read_metrics(tmp_path / "run"):
+        assert ("hinge_loss" in line) == (line["stage"] in ("course", "scorer", "proposal", "curiosity", "finetune"))
+        assert all(np.isfinite(value) for value in line.values() if not isinstance(value, str))
+    assert Priors.load(tmp_path / "run").config.networks.hinge
 
 
 def test_an_evaluation_has_the_priors_the_trials_the_policy_and_what_the_scores_were_worth(finished, tmp_path):

@@ -108,17 +108,15 @@ class SceneBank:
         table = lambda name: np.concatenate([getattr(bank, name) for bank in banks])  # noqa: E731
         out: dict[str, Any] = {name: table(name) for name in (*_PER_SCENE, "hull_vertices", "box_size")}
         out["hull_start"] = _starts(bank.hull_start for bank in banks)
-        shapes = np.cumsum([0] + [max(len(bank.hull_start) - 1, len(bank.box_size)) for bank in banks])
         statics, parts = (_starts(getattr(bank, name) for bank in banks) for name in ("static_start", "part_start"))
         out["static_start"], out["part_start"] = statics, statics[-1] + parts
-        # All banks' statics come before all banks' parts, as in each of them.
-        middle = [bank.static_start[-1] for bank in banks]
-        for name in _PER_INSTANCE:
-            columns = [getattr(bank, name) for bank in banks]
-            if name == "instance_shape":
-                columns = [column + first for column, first in zip(columns, shapes, strict=False)]
-            halves = zip(*((c[:m], c[m:]) for c, m in zip(columns, middle, strict=True)), strict=True)
-            out[name] = np.concatenate([half for side in halves for half in side]).astype(columns[0].dtype)
+        # Statics come before parts: those of all banks, as in each of them.
+        is_part = np.concatenate([np.arange(len(bank.instance_shape)) >= bank.static_start[-1] for bank in banks])
+        order = np.argsort(is_part, kind="stable")
+        out |= {name: table(name)[order] for name in _PER_INSTANCE}
+        shapes = np.cumsum([0] + [max(len(bank.hull_start) - 1, len(bank.box_size)) for bank in banks[:-1]])
+        first = np.repeat(shapes, [len(bank.instance_shape) for bank in banks])[order]
+        out["instance_shape"] = (out["instance_shape"] + first).astype(np.int32)
         return cls(collision=banks[0].collision, **out)
 
     def save(self, path: Path | str) -> None:

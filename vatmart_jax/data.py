@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -73,15 +73,30 @@ class Data:
     """The banks of one converted folder, and the training splits of more of them."""
 
     def __init__(self, folder: Path, *more: Path):
-        """Raises BankError where the banks are missing or damaged, DataError where they cannot be joined."""
+        """Raises BankError where the banks are missing or damaged, DataError where they cannot be trained on together:
+        their arrays do not fit, or `more` would train on a test object."""
         self.folder = folder
-        found = [_banks(folder), *(_banks(other, SPLITS[0]) for other in more)]
-        scenes, views = zip(*found, strict=True)
+        self._scenes, self._views = _banks(folder)
+        if more:
+            self._join(more)
+
+    def _join(self, more: Sequence[Path]) -> None:
+        scenes, views = [self._scenes], [self._views]
+        tests = set(self._scenes.object_id[np.isin(self._scenes.split, SPLITS[1:])])
+        for other in more:
+            bank, its_views = _banks(other)
+            chosen = np.flatnonzero(bank.split == SPLITS[0])
+            if seen := sorted(tests & set(bank.object_id[chosen])):
+                raise DataError(
+                    f"{other}: would train on {seen[0]}, which {self.folder} has for the test; see splits.json of both"
+                )
+            scenes.append(bank.select(chosen))
+            views.append(its_views.of_scenes(chosen))
         try:
             self._scenes = SceneBank.joined(scenes)
             self._views = ViewBank.joined(views, [len(bank) for bank in scenes])
         except ValueError as e:
-            folders = ", ".join(map(str, (folder, *more)))
+            folders = ", ".join(map(str, (self.folder, *more)))
             raise DataError(f"{folders}: cannot be trained on together: {e}; convert them with the same flags") from e
 
     def env(self, split: str, task: Task, impl: str, config: EnvConfig, physics: PhysicsConfig) -> Env:
@@ -95,10 +110,5 @@ class Data:
             raise DataError(f"{self.folder}, split {split}: {e}") from e
 
 
-def _banks(folder: Path, split: str | None = None) -> tuple[SceneBank, ViewBank]:
-    """A converted folder's banks, or what they have of one split."""
-    scenes, views = SceneBank.load(folder / "scenes.npz"), ViewBank.load(folder / "views.npz")
-    if split is None:
-        return scenes, views
-    chosen = np.flatnonzero(scenes.split == split)
-    return scenes.select(chosen), views.of_scenes(chosen)
+def _banks(folder: Path) -> tuple[SceneBank, ViewBank]:
+    return SceneBank.load(folder / "scenes.npz"), ViewBank.load(folder / "views.npz")

@@ -179,9 +179,10 @@ def _policy(folder: Path, explorer: Explorer) -> Any:
 def _evaluate_policy(
     folder: Path, env: Env, settings: Settings, trials: int, key: jax.Array, report: Report
 ) -> dict[str, Any]:
-    """Success of the policy on the objects it was trained on: fresh starts that are free and, when pulling, hold.
+    """Success of the policy on its training objects: fresh starts that are free and, when pulling, hold.
 
-    Trials stop at success, as in the paper; a part that is let go is a failure. Consumes the key.
+    `env` is of one folder: of a run on several, the others' objects are left out. Trials stop at success, as in the
+    paper; a part that is let go is a failure. Consumes the key.
     """
     explorer = Explorer(env, settings.explore)
     policy = _policy(folder, explorer)
