@@ -50,6 +50,7 @@ class Style:
     round: bool  # bars of round section
     face: str  # slab, shaker, raised, glass or louvre
     inset: bool  # fronts lie between the boards rather than over them
+    recess: float  # and this far behind their edges
     gap: float  # between neighbouring fronts
     board: float  # thickness of boards
     front: float  # thickness of doors and drawer fronts
@@ -70,7 +71,12 @@ class Style:
             board=float(rng.uniform(0.02, 0.045)),
             front=float(rng.uniform(0.02, 0.045)),
             swing=float(np.radians(rng.choice([90, 90, 90, 90, 110, 135, 170, 180]))),
+            recess=float(rng.choice([0.0, rng.uniform(0.0, 0.06)])),
         )
+
+    def depths(self, z: float) -> tuple[float, float]:
+        """Where a front's board begins and ends, z being where the carcass ends."""
+        return (z - self.recess - self.front, z - self.recess) if self.inset else (z, z + self.front)
 
 
 def pick(rng: np.random.Generator, weights: dict[str, float]) -> str:
@@ -172,17 +178,18 @@ def front_handle(rng: np.random.Generator, s: Style, r: Rect, z: float, side: st
 
 
 def door(rng: np.random.Generator, s: Style, body: Link, r: Rect, z: float, side: str, outer: bool, leaf="") -> Link:
-    """A door whose front board fills r, behind (inset) or before (overlay) the plane z of the carcass.
+    """A door whose front board fills r, behind (inset) or before (overlay) the plane z where the carcass ends.
 
     The axis is on the front edge, about which a board turns without touching what is beside or behind it; on an
     outer edge it may lie deeper, flush with the carcass's side, and the door may open further than 90 degrees.
     """
-    z0, z1 = (z - s.front, z) if s.inset else (z, z + s.front)
+    z0, z1 = s.depths(z)
     deep = outer and not s.inset and (s.front > 0.05 or rng.random() < 0.7)
     axis = z0 + s.front * rng.choice([0.0, 0.0 if s.front > 0.05 else 0.5]) if deep else z1
     link = Link("hinge rotation_door", "cabinet_door", body)
     edge = r.shrink(-s.gap / 2) if deep else r
-    link.joint = hinge(side, edge, float(axis), s.swing if outer and side in ("left", "right") else np.pi / 2)
+    wide = outer and side in ("left", "right") and not (s.inset and s.recess)
+    link.joint = hinge(side, edge, float(axis), s.swing if wide else np.pi / 2)
     for what, meshes in face(rng, s.face, r, z0, z1).items():
         link.add((leaf or "cabinet_door_surface") if what == "board" else "glass", *meshes)
     link.add("handle", *front_handle(rng, s, r, z1, side))
@@ -191,7 +198,7 @@ def door(rng: np.random.Generator, s: Style, body: Link, r: Rect, z: float, side
 
 def drawer(rng: np.random.Generator, s: Style, body: Link, front: Rect, inside: Rect, back: float, z: float) -> Link:
     """A drawer: a front board filling `front` and an open box within the cell `inside`, from depth `back` to z."""
-    z0, z1 = (z - s.front, z) if s.inset else (z, z + s.front)
+    z0, z1 = s.depths(z)
     depth = (z0 - back) * rng.uniform(0.75, 0.97)
     low = inside.shrink(0.01, 0.012)
     low = low._replace(y1=low.y0 + low.height * rng.uniform(0.5, 0.95))
@@ -251,3 +258,19 @@ def feet(rng: np.random.Generator, kind: str, r: Rect, lo: float, hi: float, wid
 
 def _moved(r: Rect, by: np.ndarray) -> Rect:
     return Rect(r.x0 + by[0], r.y0 + by[1], r.x1 + by[0], r.y1 + by[1])
+
+
+def turned(links: list[Link], angle: float) -> list[Link]:
+    """Turn links about y, in place. angle: rad."""
+    c, s = np.cos(angle), np.sin(angle)
+    r = np.array([[c, 0, s], [0, 1, 0], [-s, 0, c]])
+    for link in links:
+        link.leaves = [(name, [Mesh(m.vertices @ r.T, m.faces) for m in meshes]) for name, meshes in link.leaves]
+        if link.joint is not None:
+            link.joint = Joint(r @ link.joint.origin, r @ link.joint.axis, link.joint.upper)
+    return links
+
+
+def mirrored(meshes: list[Mesh], z: float) -> list[Mesh]:
+    """Meshes seen in a mirror at depth z."""
+    return [Mesh(m.vertices * [1, 1, -1] + [0, 0, 2 * z], m.faces[:, ::-1]) for m in meshes]

@@ -13,7 +13,20 @@ from xml.sax.saxutils import quoteattr
 
 import numpy as np
 
-from mjcf_assets.furniture import Joint, Link, Style, carcass, door, drawer, face, feet, pick, relief
+from mjcf_assets.furniture import (
+    Joint,
+    Link,
+    Style,
+    carcass,
+    door,
+    drawer,
+    face,
+    feet,
+    mirrored,
+    pick,
+    relief,
+    turned,
+)  # fmt: skip
 from mjcf_assets.solids import (
     Rect,
     board,
@@ -96,7 +109,7 @@ def fill(
         return []
     if kind == "drawer":
         return [drawer(rng, s, body, front, inside, back, z)]
-    room = z - (s.front + 0.02 if s.inset else 0.01)
+    room = s.depths(z)[0] - (0.02 if s.inset else 0.01)
     for y in np.linspace(inside.y0, inside.y1, int(rng.integers(0, 2 + int(inside.height / 0.35))) + 2)[1:-1]:
         shelf = inside._replace(y0=y - 0.01, y1=y + 0.01)
         body.add("shelf", board(shelf, back, back + (room - back) * rng.choice([0.6, 1.0])))
@@ -125,7 +138,7 @@ def column(rng: np.random.Generator, width: float, height: float, drawers: float
         return rows[::-1] if rng.random() < 0.25 else rows
     if width / height > 1.5:
         n = 2 if height > 0.5 and rng.random() < 0.4 else 1
-        kinds = [str(rng.choice(["flip", "drop", "pair", "door"], p=[0.25, 0.2, 0.3, 0.25])) for _ in range(n)]
+        kinds = [str(rng.choice(["flip", "drop", "pair", "door"], p=[0.4, 0.15, 0.25, 0.2])) for _ in range(n)]
         return [(k if width / (height / n) > 1.2 else leaf(), height / n) for k in kinds]
     if height > 1.2 and rng.random() < 0.6:
         h = height * rng.uniform(0.3, 0.7)
@@ -179,7 +192,7 @@ def _scaled(rng: np.random.Generator, *ranges: tuple[float, float]) -> np.ndarra
 def storage_furniture(rng: np.random.Generator) -> list[Link]:
     faces = {"slab": 4, "shaker": 3, "raised": 1.5, "glass": 1, "louvre": 0.5}
     s = Style.draw(rng, {"bar": 5, "rail": 1.5, "arc": 2.5, "knob": 2, "lip": 1, "none": 1}, faces)
-    kind = pick(rng, {"base": 4, "wall": 3, "tall": 2, "wardrobe": 1.5, "chest": 2.5, "sideboard": 1})
+    kind = pick(rng, {"base": 4, "wall": 3, "tall": 2, "wardrobe": 1.5, "chest": 2.5, "sideboard": 1, "console": 1})
     w, h, d = {
         "base": lambda: _scaled(rng, (0.45, 1.5), (1, 1), (0.6, 0.9)),
         "wall": lambda: _scaled(rng, (1.1, 2.6), (1, 1), (0.5, 1.1)),
@@ -187,14 +200,20 @@ def storage_furniture(rng: np.random.Generator) -> list[Link]:
         "wardrobe": lambda: _scaled(rng, (0.6, 1.1), (1, 1), (0.3, 0.5)),
         "chest": lambda: _scaled(rng, (0.5, 1.3), (1, 1), (0.45, 0.9)),
         "sideboard": lambda: _scaled(rng, (1.4, 2.6), (1, 1), (0.45, 0.7)),
+        "console": lambda: _scaled(rng, (0.8, 2.2), (1, 1), (0.35, 0.7)),
     }[kind]()
     spread = (0.3, 0.9) if kind == "wall" else (0.6, 1.4)
     columns = int(np.clip(round(w / h * rng.uniform(*spread)), 1, 3 - int(rng.random() < 0.6)))
-    drawers = {"base": 0.6, "wall": 0.0, "tall": 0.25, "wardrobe": 0.25, "chest": 0.95, "sideboard": 0.5}[kind]
+    drawers = {"base": 0.6, "wall": 0.0, "tall": 0.25, "wardrobe": 0.25, "chest": 0.95, "sideboard": 0.5,
+               "console": 0.3}[kind]  # fmt: skip
     body = Link("heavy furniture_body", "cabinet_frame")
     low = 0.0
     if kind != "wall":
         low = rng.uniform(0.05, 0.12) if kind == "base" else rng.choice([0.0, rng.uniform(0.04, 0.25)])
+    if kind == "console":
+        low = h * rng.uniform(0.35, 0.65)
+        if rng.random() < 0.5:
+            body.add("shelf", board(Rect(0.05 * w, 0.25 * low, 0.95 * w, 0.25 * low + 0.03), 0.05 * d, 0.95 * d))
     if kind == "base":
         plinth = board(Rect(0, 0, w, low), 0, d - rng.uniform(0.02, 0.12))
         body.add("base_side_panel", plinth)
@@ -207,7 +226,8 @@ def storage_furniture(rng: np.random.Generator) -> list[Link]:
     if kind in ("base", "chest", "sideboard", "wardrobe") and rng.random() < 0.45:
         o = rng.uniform(0.01, 0.06)
         body.add("top_panel", box((-o, h, 0), (w + o, h + rng.uniform(0.02, 0.05), d + o)))
-    return [*links, body]
+    # Some are used from the side, as the end of a counter is.
+    return turned([*links, body], float(rng.choice([0, np.pi / 2, -np.pi / 2], p=[0.92, 0.04, 0.04])))
 
 
 def table(rng: np.random.Generator) -> list[Link]:
@@ -397,7 +417,7 @@ def microwave(rng: np.random.Generator) -> list[Link]:
     else:
         carcass(body, oven, 0, d, wall)
         body.add("frame", frame(oven, cavity, 2, d - 0.02, d))
-    face_z = d if s.inset else d + s.front
+    z0, face_z = s.depths(d)[0], d if s.inset else d + s.front
     body.add("frame", board(panel, 0, face_z))
     if low:
         body.add("foot", *feet(rng, "round", Rect(0, 0, w, d), 0, low, 0.06))
@@ -407,9 +427,9 @@ def microwave(rng: np.random.Generator) -> list[Link]:
     side = "bottom" if drop else "left"
     links = [_as(door(rng, s, body, front, d, side, not drop, "door_frame"), "hinge door")]
     if rng.random() < 0.4:
-        c = np.array([cavity.centre[0], cavity.y0 + 0.03, (wall + d - s.front) / 2])
+        c = np.array([cavity.centre[0], cavity.y0 + 0.03, (wall + z0) / 2])
         tray = Link("hinge rotation_tray", "tray", body, Joint(c, np.array([0.0, 1, 0]), None))
-        tray.add("tray", lathe([(0.42 * min(cavity.width, d - wall - s.front), y) for y in (0, 0.015)], c, 1, sides=24))
+        tray.add("tray", lathe([(0.42 * min(cavity.width, z0 - wall), y) for y in (0, 0.015)], c, 1, sides=24))
         body.add("tray_support", lathe([(0.06, -0.03), (0.06, -0.001)], c, 1))
         links.append(tray)
     # Controls, from one end of the panel: a display, then knobs or a field of buttons.
@@ -457,12 +477,12 @@ def safe(rng: np.random.Generator) -> list[Link]:
         body.leaves = [("base_body", meshes) for _, meshes in body.leaves]
     if rng.random() < 0.5:
         y = hole.y0 + hole.height * rng.uniform(0.35, 0.65)
-        body.add("base_body", board(hole._replace(y0=y - 0.012, y1=y + 0.012), wall, d - s.front - 0.06))
+        body.add("base_body", board(hole._replace(y0=y - 0.012, y1=y + 0.012), wall, s.depths(d)[0] - 0.06))
     s.gap = max(s.gap, 0.7 * s.front**2 / hole.width)
     front = hole.shrink(s.gap) if s.inset else shell.shrink(s.gap / 2)
     side = str(rng.choice(["left", "right"], p=[0.4, 0.6]))
     link = _as(door(rng, s, body, front, d, side, True, "door"), "hinge door")
-    z = d if s.inset else d + s.front
+    z = s.depths(d)[1]
     if s.face == "raised":
         z += relief(s.front)
     sign = 1.0 if side == "left" else -1.0
@@ -501,21 +521,24 @@ def safe(rng: np.random.Generator) -> list[Link]:
 
 
 def room_door(rng: np.random.Generator) -> list[Link]:
+    """One or two leaves in a frame without a wall, opening towards its front or away from it."""
     faces = {"slab": 2, "shaker": 2, "raised": 1, "glass": 1.5, "louvre": 0.5}
     s = Style.draw(rng, {"bar": 1.5, "arc": 1, "knob": 2, "rail": 0.5, "none": 3}, faces)
-    s.inset, s.front, s.gap = True, rng.uniform(0.03, 0.06), max(s.gap, 0.008)
+    s.inset, s.front, s.gap = True, rng.uniform(0.02, 0.06), max(s.gap, 0.008)
     s.length = min(s.length, 0.4)
-    double = rng.random() < 0.3
-    w, h, d = _scaled(rng, (0.75, 1.1) if double else (0.4, 0.65), (1, 1), (0.05, 0.12))
-    jamb = rng.uniform(0.04, 0.1)
+    double = rng.random() < 0.35
+    w, h, d = _scaled(rng, (0.6, 1.1) if double else (0.35, 0.65), (1, 1), (0.04, 0.14))
+    s.recess = float(rng.choice([0.0, rng.uniform(0, max(d - s.front, 0))]))
+    jamb = w * rng.uniform(0.05, 0.18) if rng.random() < 0.4 else rng.uniform(0.02, 0.1)
     above = jamb if rng.random() < 0.7 else rng.uniform(0.15, 0.3)
     inside = Rect(jamb, 0, w - jamb, h - above)
     body = Link("static door_frame", "outside_frame")
     for x in (0.0, w - jamb):
         body.add("outside_frame", box((x, 0, 0), (x + jamb, h - above, d)))
-    if rng.random() < 0.2:
+    if rng.random() < 0.25:
         x = np.linspace(0, np.pi, 17)
-        arch = np.stack([w / 2 * (1 + np.cos(x)), h - above + (above + 0.05) * np.sin(x)], 1)
+        rise = rng.uniform(above + 0.05, max(w / 2, above + 0.1))
+        arch = np.stack([w / 2 * (1 + np.cos(x)), h - above + rise * np.sin(x)], 1)
         body.add("outside_frame", prism(arch, 2, 0, d))
     else:
         body.add("outside_frame", box((0, h - above, 0), (w, h, d)))
@@ -525,29 +548,39 @@ def room_door(rng: np.random.Generator) -> list[Link]:
         side_panel = Rect(w, 0, w + width, h)
         for what, meshes in face(rng, "glass", side_panel, 0.3 * d, 0.7 * d).items():
             body.add("fixed_part" if what == "board" else "glass", *meshes)
+    z0, z1 = s.depths(d)
     if rng.random() < 0.3:
-        body.add("fixed_part", box((jamb, 0, 0), (w - jamb, 0.012, d - s.front - 0.01)))
+        body.add("fixed_part", box((jamb, 0, 0), (w - jamb, 0.012, max(z0 - 0.01, 0.01))))
     x = inside.centre[0]
     rects = [(inside, str(rng.choice(["left", "right"])))]
     if double:
         rects = [(inside._replace(x1=x), "left"), (inside._replace(x0=x), "right")]
+        if rng.random() < 0.3:
+            del rects[int(rng.integers(2))]  # a doorway wider than its one leaf
     links = []
     levers = s.handle == "none" and rng.random() < 0.7
+    both_sides = rng.random() < 0.5
     for r, side in rects:
         front = r.shrink(s.gap, 0)._replace(y0=0.015, y1=r.y1 - s.gap)
         link = _as(door(rng, s, body, front, d, side, False, "surface_board"), "hinge rotation_door", "surface_board")
         links.append(link)
+        if both_sides and link.leaves[-1][0] == "handle":
+            link.add("handle", *mirrored(link.leaves[-1][1], (z0 + z1) / 2))
         hinge_x = front.x1 if side == "right" else front.x0
-        for y in (0.15, 0.85) if rng.random() < 0.5 else ():
+        for y in (0.15, 0.85) if s.recess == 0 and rng.random() < 0.5 else ():
             at = np.array([hinge_x, front.y0 + y * front.height - 0.04, d])
             link.add("hinge", lathe([(0.9 * s.gap, 0), (0.9 * s.gap, 0.08)], at, 1))
         if levers:
             sign = 1.0 if side == "left" else -1.0
-            at = np.array([front.x1 - 0.05 if side == "left" else front.x0 + 0.05, front.centre[1], d])
+            at = np.array([front.x1 - 0.05 if side == "left" else front.x0 + 0.05, front.centre[1], z1])
             turn = lever(rng, link, at + np.array([0, 0, 0.011]), min(0.15, 0.4 * front.width), -sign, "movable_part")
-            link.add("fixed_part", lathe([(0.028, 0), (0.024, 0.01)], at, 2))
+            rose = [lathe([(0.028, 0), (0.024, 0.01)], at, 2)]
+            if both_sides:
+                rose += mirrored(rose, (z0 + z1) / 2)
+                turn.add("movable_part", *mirrored(turn.leaves[0][1], (z0 + z1) / 2))
+            link.add("fixed_part", *rose)
             links.append(turn)
-    return [*links, body]
+    return turned([*links, body], np.pi if rng.random() < 0.4 else 0.0)
 
 
 def washing_machine(rng: np.random.Generator) -> list[Link]:

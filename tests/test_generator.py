@@ -72,7 +72,11 @@ def test_every_object_has_the_doors_and_drawers_it_says(folder, objects):
 
 
 def test_fronts_face_the_camera_and_open_towards_it(objects):
-    """The object frame's front is -x: what opens comes forward, or for the lids of washing machines, up."""
+    """The object frame's front is -x: what opens comes forward, or for the lids of washing machines, up.
+
+    Leaves in a frame may open away as well, and some furniture is used from the side.
+    """
+    otherwise = {"Door": [], "StorageFurniture": []}
     for obj in objects:
         for part in parts(obj)[0]:
             vertices = np.concatenate([v.vertices for v in obj.links[part.link].visuals])
@@ -81,7 +85,11 @@ def test_fronts_face_the_camera_and_open_towards_it(objects):
                 (obj.link_poses({part.joint: part.closed + part.sign * q})[part.link] @ middle)[:3] for q in (0.0, 0.1)
             )
             moved = ajar - closed
-            assert moved[0] < 0 or (obj.category == "WashingMachine" and moved[2] > 0)
+            if obj.category in otherwise:
+                otherwise[obj.category].append(moved[0] > -0.5 * np.linalg.norm(moved))
+            else:
+                assert moved[0] < 0 or (obj.category == "WashingMachine" and moved[2] > 0)
+    assert 0.2 < np.mean(otherwise["Door"]) < 0.6 and np.mean(otherwise["StorageFurniture"]) < 0.2
 
 
 def test_objects_fill_about_a_unit_sphere(objects):

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from scipy.spatial import cKDTree
 
 from conversion.partnet import parts, read_object
 from mjcf_assets.generator import GeneratorError, generate
@@ -59,7 +60,9 @@ def test_the_closed_object_is_stretched_and_its_parts_are_the_same(source, copie
             copy = read_object(copies / f"{name}x{k}")
             before, after = posed(original, {}), posed(copy, {})
             factor = np.ptp(after, axis=0) / np.ptp(before, axis=0)
-            np.testing.assert_allclose(after, before * factor, atol=2e-3)
+            # Each vertex has one at its place: reading sorts them, and near ties can change places.
+            for a, b in ((after, before * factor), (before * factor, after)):
+                assert len(a) == len(b) and cKDTree(a).query(b)[0].max() < 2e-3
             assert (np.abs(np.log(factor)) <= 2 * LIMIT).all() and abs(np.log(factor).sum()) < 1e-2
             factors.append(factor)
             again, _ = parts(copy)
