@@ -10,7 +10,22 @@ from itertools import pairwise
 
 import numpy as np
 
-from mjcf_assets.solids import Mesh, Rect, board, box, corners, frame, lathe, loft, place, prism, rod, rounded, sweep
+from mjcf_assets.solids import (
+    Mesh,
+    Rect,
+    board,
+    box,
+    corners,
+    frame,
+    lathe,
+    loft,
+    place,
+    plate,
+    prism,
+    rod,
+    rounded,
+    sweep,
+)
 
 HANDLES = ("bar", "rail", "arc", "knob", "lip", "none")
 
@@ -55,6 +70,7 @@ class Style:
     board: float  # thickness of boards
     front: float  # thickness of doors and drawer fronts
     swing: float  # how far doors open, rad
+    porthole: bool  # single doors are portholes where there is room
 
     @classmethod
     def draw(cls, rng: np.random.Generator, handles: dict[str, float], faces: dict[str, float]) -> Style:
@@ -72,6 +88,8 @@ class Style:
             front=float(rng.uniform(0.02, 0.045)),
             swing=float(np.radians(rng.choice([90, 90, 90, 90, 110, 135, 170, 180]))),
             recess=float(rng.choice([0.0, rng.uniform(0.0, 0.06)])),
+            # Of a generator of its own, so that objects without portholes are the same as before there were any.
+            porthole=bool(rng.spawn(1)[0].random() < 0.15),
         )
 
     def depths(self, z: float) -> tuple[float, float]:
@@ -193,6 +211,48 @@ def door(rng: np.random.Generator, s: Style, body: Link, r: Rect, z: float, side
     for what, meshes in face(rng, s.face, r, z0, z1).items():
         link.add((leaf or "cabinet_door_surface") if what == "board" else "glass", *meshes)
     link.add("handle", *front_handle(rng, s, r, z1, side))
+    return link
+
+
+def porthole(rng: np.random.Generator, s: Style, body: Link, cell: Rect, z: float, side: str, leaf: str) -> Link:
+    """A round door, or one with round corners, at the hole of a panel that fills `cell`; often hollow as a dish is.
+
+    The panel ends at z, or with the carcass's recess behind it.
+    """
+    z0, z1 = s.depths(z)
+    small = min(cell.width, cell.height)
+    r = cell.shrink(rng.uniform(0.03, 0.12) * small)
+    if rng.random() < 0.7:
+        spare = np.array([r.width, r.height]) - min(r.width, r.height)
+        r = r.shrink(*spare / 2)
+    half = min(r.width, r.height) / 2
+    radius = half * rng.choice([1.0, rng.uniform(0.3, 1.0)], p=[0.7, 0.3])
+    rim = half * rng.uniform(0.1, 0.25)
+    inner, floor = r.shrink(rim), r.shrink(rim + half * rng.uniform(0.2, 0.4))
+    # An inset leaf's far edge swings out past the hole's.
+    slit = max(s.gap, 0.6 * s.front**2 / half)
+    hole, front = (r.shrink(-slit), z1) if s.inset else (r.shrink(0.7 * rim), z0)
+    outline = lambda q, at: place(rounded(q, radius * min(q.width, q.height) / (2 * half), start=0), 2, at)  # noqa: E731
+    body.add("frame", plate(cell, outline(hole, 0.0)[:, :2], 2, front - s.board, front))
+
+    # The floor of a dish must pass the hole as well, turning about the leaf's front edge on the hinge's side.
+    across = [(q.width if side in ("left", "right") else q.height) / 2 for q in (r, hole, floor)]
+    room = np.sqrt((across[0] + across[1] - 0.01) ** 2 - (across[0] + across[2]) ** 2)
+    wall = 0.012
+    dish = min(rng.choice([0.0, rng.uniform(0.2, 1.0)], p=[0.3, 0.7]) * half, room - wall)
+    rings = [(r, z0), (r, z1)]
+    if dish:
+        back = min(z1 - dish - wall, z0)
+        rings = [(floor, back), (inner, z0), *rings, (inner, z1), (floor, z1 - dish)]
+    link = Link("hinge rotation_door", "cabinet_door", body)
+    link.joint = hinge(side, r, z1, np.pi / 2 if s.inset else max(s.swing, np.pi / 2))
+    link.add(leaf, loft([outline(q, at) for q, at in rings]))
+    if s.handle != "none":
+        c, upright = r.centre, side in ("left", "right")
+        reach = np.array([r.width, r.height]) / 2 - rim / 2
+        toward = {"left": (1, 0), "right": (-1, 0), "bottom": (0, 1), "top": (0, -1)}[side]
+        at = np.array([*(c + toward * reach), z1])
+        link.add("handle", *handle(rng, s, at, 0.4 * half, upright))
     return link
 
 

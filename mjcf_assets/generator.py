@@ -24,6 +24,7 @@ from mjcf_assets.furniture import (
     feet,
     mirrored,
     pick,
+    porthole,
     relief,
     turned,
 )  # fmt: skip
@@ -109,6 +110,8 @@ def fill(
         return []
     if kind == "drawer":
         return [drawer(rng, s, body, front, inside, back, z)]
+    if kind == "door" and s.porthole and 0.5 < inside.width / inside.height < 2:
+        return [porthole(rng, s, body, inside, z, str(rng.choice(["left", "right"])), "cabinet_door_surface")]
     room = s.depths(z)[0] - (0.02 if s.inset else 0.01)
     for y in np.linspace(inside.y0, inside.y1, int(rng.integers(0, 2 + int(inside.height / 0.35))) + 2)[1:-1]:
         shelf = inside._replace(y0=y - 0.01, y1=y + 0.01)
@@ -192,6 +195,8 @@ def _scaled(rng: np.random.Generator, *ranges: tuple[float, float]) -> np.ndarra
 def storage_furniture(rng: np.random.Generator) -> list[Link]:
     faces = {"slab": 4, "shaker": 3, "raised": 1.5, "glass": 1, "louvre": 0.5}
     s = Style.draw(rng, {"bar": 5, "rail": 1.5, "arc": 2.5, "knob": 2, "lip": 1, "none": 1}, faces)
+    if s.porthole:
+        return case_with_portholes(rng, s)
     kind = pick(rng, {"base": 4, "wall": 3, "tall": 2, "wardrobe": 1.5, "chest": 2.5, "sideboard": 1, "console": 1})
     w, h, d = {
         "base": lambda: _scaled(rng, (0.45, 1.5), (1, 1), (0.6, 0.9)),
@@ -228,6 +233,28 @@ def storage_furniture(rng: np.random.Generator) -> list[Link]:
         body.add("top_panel", box((-o, h, 0), (w + o, h + rng.uniform(0.02, 0.05), d + o)))
     # Some are used from the side, as the end of a counter is.
     return turned([*links, body], float(rng.choice([0, np.pi / 2, -np.pi / 2], p=[0.92, 0.04, 0.04])))
+
+
+def case_with_portholes(rng: np.random.Generator, s: Style) -> list[Link]:
+    """One to three portholes beside or above each other, in a case that may have a closed strip above them."""
+    n = int(rng.choice([1, 2, 3], p=[0.6, 0.3, 0.1]))
+    beside = rng.random() < 0.5
+    wide, high = (0.7 * n, 1.2 * n) if beside else (0.7, 1.2), (0.9, 1.1) if beside else (0.9 * n, 1.1 * n)
+    w, h, d = _scaled(rng, wide, high, (0.4, 1.1))
+    body = Link("heavy furniture_body", "cabinet_frame")
+    top = h * (1 - rng.choice([0.0, rng.uniform(0.08, 0.2)]))
+    if top < h:
+        body.add("top_panel", board(Rect(0, top, w, h), 0, d))
+    carcass(body, Rect(0, 0, w, top), 0, d, s.board)
+    inside = Rect(0, 0, w, top).shrink(s.board)
+    links = []
+    for k in range(n):
+        x, y = ((k / n, (k + 1) / n), (0.0, 1.0)) if beside else ((0.0, 1.0), (k / n, (k + 1) / n))
+        cell = Rect(inside.x0 + x[0] * inside.width, inside.y0 + y[0] * inside.height,
+                    inside.x0 + x[1] * inside.width, inside.y0 + y[1] * inside.height)  # fmt: skip
+        side = str(rng.choice(["left", "right", "bottom", "top"], p=[0.42, 0.42, 0.1, 0.06]))
+        links.append(porthole(rng, s, body, cell, d, side, "cabinet_door_surface"))
+    return [*links, body]
 
 
 def table(rng: np.random.Generator) -> list[Link]:
@@ -425,8 +452,12 @@ def microwave(rng: np.random.Generator) -> list[Link]:
     if s.inset:
         s.gap = max(s.gap, s.front**2 / front.width)
     side = "bottom" if drop else "left"
-    links = [_as(door(rng, s, body, front, d, side, not drop, "door_frame"), "hinge door")]
-    if rng.random() < 0.4:
+    if s.porthole:
+        leaf = porthole(rng, s, body, cavity, d, side, "door_frame")
+    else:
+        leaf = door(rng, s, body, front, d, side, not drop, "door_frame")
+    links = [_as(leaf, "hinge door")]
+    if not s.porthole and rng.random() < 0.4:
         c = np.array([cavity.centre[0], cavity.y0 + 0.03, (wall + z0) / 2])
         tray = Link("hinge rotation_tray", "tray", body, Joint(c, np.array([0.0, 1, 0]), None))
         tray.add("tray", lathe([(0.42 * min(cavity.width, z0 - wall), y) for y in (0, 0.015)], c, 1, sides=24))

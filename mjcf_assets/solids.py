@@ -69,9 +69,12 @@ def corners(r: Rect) -> np.ndarray:
     return np.array([[r.x0, r.y0], [r.x1, r.y0], [r.x1, r.y1], [r.x0, r.y1]])
 
 
-def rounded(r: Rect, radius: float, sides: int = 24) -> np.ndarray:
-    """Outline of a rectangle with round corners; an ellipse where the radius is half the sides. [sides, 2]."""
-    t = 2 * np.pi * (np.arange(sides) + 0.5) / sides
+def rounded(r: Rect, radius: float, sides: int = 24, start: float = 0.5) -> np.ndarray:
+    """Outline of a rectangle with round corners; an ellipse where the radius is half the sides. [sides, 2].
+
+    start: where the first point lies, counted in points from the middle of the +x side.
+    """
+    t = 2 * np.pi * (np.arange(sides) + start) / sides
     half = np.array([r.width, r.height]) / 2
     bend = np.minimum(radius, half)
     unit = np.stack([np.cos(t), np.sin(t)], 1)

@@ -11,9 +11,9 @@ import trimesh
 import yourdfpy
 
 from conversion.partnet import PartNetObject, parts, read_object
-from mjcf_assets.furniture import Joint, Link, turned
-from mjcf_assets.generator import CYCLE, TRAINING, GeneratorError, generate
-from mjcf_assets.solids import box
+from mjcf_assets.furniture import Joint, Link, Style, porthole, turned
+from mjcf_assets.generator import CYCLE, TRAINING, GeneratorError, generate, storage_furniture
+from mjcf_assets.solids import Mesh, Rect, box
 
 COUNT = 60
 
@@ -136,11 +136,44 @@ def test_parts_swing_free(objects):
                 points = np.concatenate([at(k, v) for k in moving for v in obj.links[k].visuals])
                 for k, link in obj.links.items():
                     for v in link.visuals if k not in moving else ():
-                        mesh = trimesh.Trimesh(at(k, v), v.faces, process=False)
-                        near = points[((points > mesh.bounds[0]) & (points < mesh.bounds[1])).all(1)]
-                        inside = near[mesh.contains(near)] if len(near) else near
-                        depth = trimesh.proximity.closest_point(mesh, inside)[1] if len(inside) else np.zeros(1)
-                        assert depth.max() < 3e-3, (obj.id, part.link, share, k, v.name)
+                        assert _depth(points, Mesh(at(k, v), v.faces)) < 3e-3, (obj.id, part.link, share, k, v.name)
+
+
+def _depth(points: np.ndarray, mesh: Mesh) -> float:
+    """How far the deepest of the points [n, 3] lies inside a mesh."""
+    solid = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
+    near = points[((points > solid.bounds[0]) & (points < solid.bounds[1])).all(1)]
+    inside = near[solid.contains(near)] if len(near) else near
+    return trimesh.proximity.closest_point(solid, inside)[1].max() if len(inside) else 0.0
+
+
+@pytest.mark.parametrize("side", ["left", "right", "bottom", "top"])
+def test_portholes_are_closed_meshes_that_swing_free_of_their_panel(side):
+    cell = Rect(-0.4, -0.3, 0.4, 0.3)
+    hollow = 0
+    for seed in range(20):
+        rng = np.random.default_rng(seed)
+        style, body = Style.draw(rng, {"bar": 1, "none": 1}, {"slab": 1}), Link("heavy body", "frame")
+        link = porthole(rng, style, body, cell, 0.5, side, "leaf")
+        (panel,), (leaf,) = body.leaves[0][1], link.leaves[0][1]
+        for mesh in (panel, leaf):
+            solid = trimesh.Trimesh(mesh.vertices, mesh.faces)
+            assert solid.is_watertight and solid.volume > 0
+        hollow += np.ptp(leaf.vertices[:, 2]) > style.front + 1e-9
+        for q in np.linspace(0, 1, 9) * link.joint.upper:
+            turn = trimesh.transformations.rotation_matrix(q, link.joint.axis, link.joint.origin)
+            assert _depth(trimesh.transform_points(leaf.vertices, turn), panel) < 3e-3, (seed, q)
+    assert 0 < hollow < 20
+
+
+def test_portholes_are_where_the_style_has_them():
+    drawn = {}
+    for seed in range(60):
+        rng = np.random.default_rng(seed)
+        wanted = Style.draw(np.random.default_rng(seed), {"bar": 1}, {"slab": 1}).porthole
+        body = storage_furniture(rng)[-1]
+        drawn.setdefault(wanted, []).append(any(name == "frame" for name, _ in body.leaves))
+    assert all(drawn[True]) and not any(drawn[False]) and len(drawn[True]) > 3
 
 
 @pytest.mark.parametrize(("count", "seed"), [(0, 0), (100_000, 0), (3, -1)])
