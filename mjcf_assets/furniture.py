@@ -70,11 +70,16 @@ class Style:
     board: float  # thickness of boards
     front: float  # thickness of doors and drawer fronts
     swing: float  # how far doors open, rad
+    sheet: float  # and this where they are sheets of metal or plastic, else 0
     porthole: bool  # single doors are portholes where there is room
 
     @classmethod
     def draw(cls, rng: np.random.Generator, handles: dict[str, float], faces: dict[str, float]) -> Style:
         reach = float(np.clip(rng.lognormal(np.log(0.047), 0.45), 0.012, 0.095))
+        # Of a generator of their own, so that objects without them are the same as before there were any.
+        later = rng.spawn(1)[0]
+        porthole = bool(later.random() < 0.15)
+        sheet = float(later.uniform(0.003, 0.012)) if later.random() < 0.3 else 0.0
         return cls(
             handle=pick(rng, handles),
             reach=reach,
@@ -85,11 +90,11 @@ class Style:
             inset=bool(rng.random() < 0.35),
             gap=float(rng.uniform(0.005, 0.012)),
             board=float(rng.uniform(0.02, 0.045)),
-            front=float(rng.uniform(0.02, 0.045)),
+            front=sheet or float(rng.uniform(0.02, 0.045)),
+            sheet=sheet,
+            porthole=porthole,
             swing=float(np.radians(rng.choice([90, 90, 90, 90, 110, 135, 170, 180]))),
             recess=float(rng.choice([0.0, rng.uniform(0.0, 0.06)])),
-            # Of a generator of its own, so that objects without portholes are the same as before there were any.
-            porthole=bool(rng.spawn(1)[0].random() < 0.15),
         )
 
     def depths(self, z: float) -> tuple[float, float]:

@@ -368,7 +368,7 @@ def lever(rng: np.random.Generator, parent: Link, at: np.ndarray, reach: float, 
 def refrigerator(rng: np.random.Generator) -> list[Link]:
     handles = {"bar": 3, "rail": 2, "arc": 2, "lip": 0.7, "knob": 0.2, "none": 6}
     s = Style.draw(rng, handles, {"slab": 5, "shaker": 0.7, "glass": 1})
-    s.inset, s.front = False, rng.uniform(0.04, 0.12)
+    s.inset, s.front = False, s.sheet or rng.uniform(0.04, 0.12)
     s.swing = float(np.radians(rng.choice([90, 120, 160, 180])))
     kind = pick(rng, {"single": 3, "two": 3, "side": 2, "french": 1.5, "wide": 0.7})
     w, h, d = {
@@ -428,7 +428,7 @@ def refrigerator(rng: np.random.Generator) -> list[Link]:
 def microwave(rng: np.random.Generator) -> list[Link]:
     handles = {"bar": 3, "rail": 2, "arc": 2, "lip": 1, "knob": 0.3, "none": 11}
     s = Style.draw(rng, handles, {"slab": 2, "shaker": 1.5, "glass": 5})
-    s.inset, s.front = bool(rng.random() < 0.15), rng.uniform(0.025, 0.07)
+    s.inset, s.front = bool(rng.random() < 0.15), s.sheet or rng.uniform(0.025, 0.07)
     s.swing = float(np.radians(rng.choice([90, 90, 110, 150])))
     w, h, d = _scaled(rng, (1.5, 2.1), (1, 1), (0.9, 1.5))
     low = rng.choice([0.0, 0.03])
@@ -491,7 +491,7 @@ def microwave(rng: np.random.Generator) -> list[Link]:
 
 def safe(rng: np.random.Generator) -> list[Link]:
     s = Style.draw(rng, {"none": 1}, {"slab": 3, "raised": 1})
-    s.inset, s.front = bool(rng.random() < 0.6), rng.uniform(0.04, 0.1)
+    s.inset, s.front = bool(rng.random() < 0.6), s.sheet or rng.uniform(0.04, 0.1)
     s.swing = float(np.radians(rng.choice([90, 120, 160, 170])))
     w, h, d = _scaled(rng, (0.55, 1.15), (1, 1), (0.6, 1.1))
     body = Link("heavy safe_body", "base_body")
@@ -555,7 +555,7 @@ def room_door(rng: np.random.Generator) -> list[Link]:
     """One or two leaves in a frame without a wall, opening towards its front or away from it."""
     faces = {"slab": 2, "shaker": 2, "raised": 1, "glass": 1.5, "louvre": 0.5}
     s = Style.draw(rng, {"bar": 1.5, "arc": 1, "knob": 2, "rail": 0.5, "none": 3}, faces)
-    s.inset, s.front, s.gap = True, rng.uniform(0.02, 0.06), max(s.gap, 0.008)
+    s.inset, s.front, s.gap = True, s.sheet or rng.uniform(0.02, 0.06), max(s.gap, 0.008)
     s.length = min(s.length, 0.4)
     double = rng.random() < 0.35
     w, h, d = _scaled(rng, (0.6, 1.1) if double else (0.35, 0.65), (1, 1), (0.04, 0.14))

@@ -12,7 +12,15 @@ import yourdfpy
 
 from conversion.partnet import PartNetObject, parts, read_object
 from mjcf_assets.furniture import Joint, Link, Style, porthole, turned
-from mjcf_assets.generator import CYCLE, TRAINING, GeneratorError, generate, storage_furniture
+from mjcf_assets.generator import (
+    CYCLE,
+    TRAINING,
+    GeneratorError,
+    generate,
+    microwave,
+    refrigerator,
+    storage_furniture,
+)
 from mjcf_assets.solids import Mesh, Rect, box
 
 COUNT = 60
@@ -174,6 +182,20 @@ def test_portholes_are_where_the_style_has_them():
         body = storage_furniture(rng)[-1]
         drawn.setdefault(wanted, []).append(any(name == "frame" for name, _ in body.leaves))
     assert all(drawn[True]) and not any(drawn[False]) and len(drawn[True]) > 3
+
+
+def test_fronts_are_boards_or_sheets():
+    drawn = {False: 0, True: 0}
+    for seed in range(40):
+        style = Style.draw(np.random.default_rng(seed), {"bar": 1}, {"slab": 1})
+        for maker in (refrigerator, microwave):
+            link = next(x for x in maker(np.random.default_rng(seed)) if x.name == "door")
+            if style.porthole and maker is microwave:
+                continue  # may be hollow
+            thick = max(np.ptp(m.vertices[:, 2]) for m in link.leaves[0][1])
+            assert thick <= style.sheet + 1e-9 if style.sheet else thick > 0.02
+            drawn[bool(style.sheet)] += 1
+    assert 0.15 < drawn[True] / sum(drawn.values()) < 0.45
 
 
 @pytest.mark.parametrize(("count", "seed"), [(0, 0), (100_000, 0), (3, -1)])
