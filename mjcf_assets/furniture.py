@@ -237,21 +237,21 @@ def porthole(rng: np.random.Generator, s: Style, body: Link, cell: Rect, z: floa
     # An inset leaf's far edge swings out past the hole's.
     slit = max(s.gap, 0.6 * s.front**2 / half)
     hole, front = (r.shrink(-slit), z1) if s.inset else (r.shrink(0.7 * rim), z0)
-    outline = lambda q, at: place(rounded(q, radius * min(q.width, q.height) / (2 * half), start=0), 2, at)  # noqa: E731
-    body.add("frame", plate(cell, outline(hole, 0.0)[:, :2], 2, front - s.board, front))
+    ring = lambda q: rounded(q, radius * min(q.width, q.height) / (2 * half), start=0)  # noqa: E731
+    body.add("frame", plate(cell, ring(hole), 2, front - s.board, front))
 
     # The floor of a dish must pass the hole as well, turning about the leaf's front edge on the hinge's side.
     across = [(q.width if side in ("left", "right") else q.height) / 2 for q in (r, hole, floor)]
-    room = np.sqrt((across[0] + across[1] - 0.01) ** 2 - (across[0] + across[2]) ** 2)
+    room = np.sqrt(max((across[0] + across[1] - 0.01) ** 2 - (across[0] + across[2]) ** 2, 0))
     wall = 0.012
     dish = min(rng.choice([0.0, rng.uniform(0.2, 1.0)], p=[0.3, 0.7]) * half, room - wall)
     rings = [(r, z0), (r, z1)]
-    if dish:
+    if dish > 0:
         back = min(z1 - dish - wall, z0)
         rings = [(floor, back), (inner, z0), *rings, (inner, z1), (floor, z1 - dish)]
     link = Link("hinge rotation_door", "cabinet_door", body)
     link.joint = hinge(side, r, z1, np.pi / 2 if s.inset else max(s.swing, np.pi / 2))
-    link.add(leaf, loft([outline(q, at) for q, at in rings]))
+    link.add(leaf, loft([place(ring(q), 2, at) for q, at in rings]))
     if s.handle != "none":
         c, upright = r.centre, side in ("left", "right")
         reach = np.array([r.width, r.height]) / 2 - rim / 2
