@@ -54,12 +54,27 @@ def measure(folder: Path) -> tuple[Measured, list[np.ndarray]]:
             add("range of doors, degrees" if part.kind == "door" else "range of drawers, unit lengths",
                 np.rad2deg(part.width) if part.kind == "door" else part.width)  # fmt: skip
             own = [v for v in visuals if v.is_handle]
+            if part.kind == "door" and len(own) < len(visuals):
+                add("thickness of a door", _thickness(np.concatenate(
+                    [v.vertices[v.faces].reshape(-1, 3) for v in visuals if not v.is_handle])))  # fmt: skip
             fingers = any(h.visual for h in handles(obj, part, []))
             add("handle: none, knob or lip, bar", 0 if not own else 2 if fingers else 1)
             if own:
                 size = np.sort(np.ptp(np.concatenate([v.vertices for v in own]), axis=0))
                 add("length of a part's handles", size[2])
     return out, cells
+
+
+def _thickness(corners: np.ndarray) -> float:
+    """Median over rays through triangles [3 n, 3] along their thinnest extent, from the first to the last hit."""
+    low, high = corners.min(axis=0), corners.max(axis=0)
+    across = int(np.argmin(high - low))
+    starts = np.random.default_rng(0).uniform(low, high, (200, 3))
+    starts[:, across] = low[across] - 0.1
+    mesh = trimesh.Trimesh(corners, np.arange(len(corners)).reshape(-1, 3), process=False)
+    ways = np.tile(np.eye(3)[across], (len(starts), 1))
+    hits, rays, _ = mesh.ray.intersects_location(starts, ways, multiple_hits=True)
+    return float(np.median([np.ptp(hits[rays == ray, across]) for ray in np.unique(rays)]))
 
 
 def _cells(obj: PartNetObject) -> np.ndarray:
