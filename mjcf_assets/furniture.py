@@ -69,8 +69,8 @@ class Style:
     gap: float  # between neighbouring fronts
     board: float  # thickness of boards
     front: float  # thickness of doors and drawer fronts
+    sheet: float  # that thickness where they are sheets of metal or plastic, else 0
     swing: float  # how far doors open, rad
-    sheet: float  # and this where they are sheets of metal or plastic, else 0
     porthole: bool  # single doors are portholes where there is room
 
     @classmethod
@@ -225,8 +225,7 @@ def porthole(rng: np.random.Generator, s: Style, body: Link, cell: Rect, z: floa
     The panel ends at z, or with the carcass's recess behind it.
     """
     z0, z1 = s.depths(z)
-    small = min(cell.width, cell.height)
-    r = cell.shrink(rng.uniform(0.03, 0.12) * small)
+    r = cell.shrink(rng.uniform(0.03, 0.12) * min(cell.width, cell.height))
     if rng.random() < 0.7:
         spare = np.array([r.width, r.height]) - min(r.width, r.height)
         r = r.shrink(*spare / 2)

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Collection
+from itertools import pairwise
 from pathlib import Path
 from xml.sax.saxutils import quoteattr
 
@@ -248,10 +249,8 @@ def case_with_portholes(rng: np.random.Generator, s: Style) -> list[Link]:
     carcass(body, Rect(0, 0, w, top), 0, d, s.board)
     inside = Rect(0, 0, w, top).shrink(s.board)
     links = []
-    for k in range(n):
-        x, y = ((k / n, (k + 1) / n), (0.0, 1.0)) if beside else ((0.0, 1.0), (k / n, (k + 1) / n))
-        cell = Rect(inside.x0 + x[0] * inside.width, inside.y0 + y[0] * inside.height,
-                    inside.x0 + x[1] * inside.width, inside.y0 + y[1] * inside.height)  # fmt: skip
+    for lo, hi in pairwise(np.linspace(*((inside.x0, inside.x1) if beside else (inside.y0, inside.y1)), n + 1)):
+        cell = inside._replace(x0=lo, x1=hi) if beside else inside._replace(y0=lo, y1=hi)
         side = str(rng.choice(["left", "right", "bottom", "top"], p=[0.42, 0.42, 0.1, 0.06]))
         links.append(porthole(rng, s, body, cell, d, side, "cabinet_door_surface"))
     return [*links, body]
@@ -457,7 +456,7 @@ def microwave(rng: np.random.Generator) -> list[Link]:
     else:
         leaf = door(rng, s, body, front, d, side, not drop, "door_frame")
     links = [_as(leaf, "hinge door")]
-    if not s.porthole and rng.random() < 0.4:
+    if not s.porthole and rng.random() < 0.4:  # where a hollow leaf would reach in
         c = np.array([cavity.centre[0], cavity.y0 + 0.03, (wall + z0) / 2])
         tray = Link("hinge rotation_tray", "tray", body, Joint(c, np.array([0.0, 1, 0]), None))
         tray.add("tray", lathe([(0.42 * min(cavity.width, z0 - wall), y) for y in (0, 0.015)], c, 1, sides=24))

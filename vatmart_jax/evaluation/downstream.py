@@ -41,6 +41,7 @@ def downstream(
 ) -> dict[str, Any]:
     """Success of a method over `trials` random views and tasks; the same ones for every method with the same key.
 
+    `lost_grip` counts trials that do not hold the part in the end; `no_grasp` those of them that never did.
     Of a method that scores its trials also the mean score (`said`) and the reliability curve.
 
     Consumes the key.
@@ -57,6 +58,7 @@ def downstream(
             "success_any_waypoint": final.valid & within.any(1),
             "in_collision": final.in_collision,
             "lost_grip": ~final.in_collision & ~final.held,
+            "no_grasp": ~final.in_collision & ~final.valid & ~final.physics.diverged,
             "diverged": final.physics.diverged,
             "scene": final.physics.scene,
         } | ({} if score is None else {"said": score})
