@@ -12,6 +12,7 @@ from vatmart_jax.config import from_json, to_json
 from vatmart_jax.data import Data
 from vatmart_jax.env import TASKS, EnvConfig
 from vatmart_jax.errors import UserError
+from vatmart_jax.evaluation.downstream import downstream, random_method
 from vatmart_jax.evaluation.evaluate import METRICS, evaluate
 from vatmart_jax.inference import Priors
 from vatmart_jax.perception.networks import NetworksConfig
@@ -116,6 +117,14 @@ def test_an_evaluation_has_the_priors_the_trials_the_policy_and_what_the_scores_
     assert json.loads((tmp_path / "evaluation.json").read_text())["runs"] == [found]
     assert (tmp_path / "evaluation.md").read_text().startswith(table)
     assert (tmp_path / "reliability.png").stat().st_size > 10_000
+
+
+@pytest.mark.parametrize("task", ["push-drawer", "pull-drawer"])
+def test_failures_are_told_apart(converted, task):
+    env = Data(converted).env("test_shapes", TASKS[task], "c", TINY.env, TINY.physics)
+    row = downstream(env, random_method(env), 48, jax.random.key(0))
+    assert row["success"] + row["in_collision"] + row["lost_grip"] <= 1
+    assert row["no_grasp"] <= row["lost_grip"] and (row["no_grasp"] > 0) == (task == "pull-drawer")
 
 
 @pytest.mark.parametrize("stage, done", [("explore", 2), ("scorer", 3)])
