@@ -42,7 +42,7 @@ class TD3State:
 
     policy: Any
     critics: Any  # leading axis 2
-    target_policy: Any
+    target_policy: Any  # running mean of the policy; what a run keeps
     target_critics: Any
     policy_opt: optax.OptState
     critic_opt: optax.OptState
