@@ -91,7 +91,7 @@ def test_proposals_at_many_points_are_those_at_each(config) -> None:
     networks, fresh = Networks(config.networks), t.begin(jax.random.key(0), config)
     f, contact = jax.random.normal(jax.random.key(0), (5, 128)), jax.random.normal(jax.random.key(1), (5, 3))
     task, z = jnp.linspace(0.1, 0.5, 5), jax.random.normal(jax.random.key(2), (7, 128))
-    at = lambda f: Features(f, f, f)  # noqa: E731
+    at = lambda f: Features(f, f, f, f[..., :0])  # noqa: E731
     many = networks.propose(fresh.params, at(f[:, None]), contact[:, None], task[:, None], z)
     one = networks.propose(fresh.params, at(f[3]), contact[3], task[3], z[2])
     assert many.shape == (5, 7, 30)

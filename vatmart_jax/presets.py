@@ -73,7 +73,10 @@ class Settings:
 
 # Two cores: small encoders, and few probes of few proposals where the paper has the mean of the best 5 of 100.
 _ON_CPU = PerceptionConfig(
-    networks=NetworksConfig(pointnet=SMALL, course=(128, 128), hinge=True), probes=4, proposals=32, best=2
+    networks=NetworksConfig(pointnet=SMALL, course=(128, 128), hinge=True, hand=(32, 64)),
+    probes=4,
+    proposals=32,
+    best=2,
 )
 
 PRESETS = {

@@ -24,7 +24,7 @@ from vatmart_jax.geometry import (
     rot6d_from_matrix,
     since_start,
 )
-from vatmart_jax.perception.pointnet2 import Grouping, PointNet2, PointNetConfig
+from vatmart_jax.perception.pointnet2 import Grouping, PointNet2, PointNetConfig, Shared, surroundings
 
 Params = dict  # of the networks' names to their Flax parameters
 
@@ -33,6 +33,7 @@ Params = dict  # of the networks' names to their Flax parameters
 TASK_SCALE = 3.0
 MOVE_SCALE = 5.0
 TURN_SCALE = 2.0
+HAND_SCALE = 10.0  # points around the contact lie within 0.15 unit lengths of it
 COURSE = 3 * WAYPOINTS + 3
 AXIS_AND_ARM = 6
 SCALE = (1.0,) * 6 + ((MOVE_SCALE,) * 3 + (TURN_SCALE,) * 3) * WAYPOINTS  # of the 30 numbers of a trajectory
@@ -68,20 +69,26 @@ class NetworksConfig:
     says. Without it, as in the paper, they find out for themselves."""
     hinge: bool = False
     """The course of a door is an arc: its head tells where the hinge is, the rest is geometry. Drawers have none."""
+    hand: tuple[int, ...] = ()
+    """Widths of a network over the points around the contact as the hand at the start sees them, which the scorer
+    reads: what the fingers would close on or run into. The paper has none."""
 
     def __post_init__(self) -> None:
         if self.course and self.separate:
             raise ValueError("a course needs the shared encoder: leave out one of `course` and `separate`")
         if self.hinge and not self.course:
             raise ValueError("a hinge is told by the course's head: give `course` its widths, or leave out `hinge`")
+        if self.hand and not self.pointnet.around:
+            raise ValueError("the hand sees the groups of `pointnet.around`: give it some, or leave out `hand`")
 
 
 class Features(NamedTuple):
-    """What each head reads of a view at Q query points; the same array where the heads share an encoder."""
+    """What the heads read of a view at Q query points; the first three are one array where they share an encoder."""
 
     scorer: jax.Array  # [Q, feature_dim]
     proposal: jax.Array  # [Q, feature_dim]
     actionability: jax.Array  # [Q, feature_dim]
+    around: jax.Array  # [Q, 3 K] from the query to the points around it, K of them where the networks have `hand`
 
 
 @dataclass(frozen=True)
@@ -118,7 +125,8 @@ class Networks:
             for name in self.encoders("scorer", "proposal", "actionability")
         }
         course = (jnp.zeros(COURSE),) if self.config.course else ()
-        params["scorer"] = self._scorer.init(next(keys), trajectory, f, contact, task, *course)["params"]
+        around = jnp.zeros(3) if self.config.hand else None
+        params["scorer"] = self._scorer.init(next(keys), trajectory, f, contact, task, *course, around=around)["params"]
         params["posterior"] = self._posterior.init(next(keys), trajectory, f, contact, task, *course)["params"]
         params["decoder"] = self._decoder.init(next(keys), f, contact, task, *course, z)["params"]
         params["actionability"] = self._actionability.init(next(keys), f, contact, task, *course)["params"]
@@ -138,8 +146,9 @@ class Networks:
         vmap it over views. What no head reads afterwards is not computed under jit.
         """
         encode = lambda name: PointNet2(self.config.pointnet).apply({"params": params[name]}, points, grouping, which)  # noqa: E731
-        found = [encode(name) for name in self.encoders(*Features._fields)]
-        return Features(*(found if self.config.separate else found * 3))  # pyright: ignore[reportArgumentType]
+        found = [encode(name) for name in self.encoders("scorer", "proposal", "actionability")]
+        around = surroundings(points, grouping, which) if self.config.hand else jnp.zeros((len(found[0]), 0))
+        return Features(*(found if self.config.separate else found * 3), around)  # pyright: ignore[reportArgumentType, reportCallIssue]
 
     def score(
         self,
@@ -155,7 +164,8 @@ class Networks:
         course: [..., 15], read in place of what the networks themselves say of it.
         """
         at = self._at(params, f, f.scorer, contact, task, course)
-        return self._scorer.apply({"params": params["scorer"]}, trajectory, *at)[..., 0]  # pyright: ignore
+        around = f.around if self.config.hand else None
+        return self._scorer.apply({"params": params["scorer"]}, trajectory, *at, around=around)[..., 0]  # pyright: ignore
 
     def posterior(
         self, params: Params, f: Features, contact: jax.Array, task: jax.Array, trajectory: jax.Array
@@ -253,14 +263,21 @@ class Head(nn.Module):
 
 
 class TrajectoryHead(nn.Module):
-    """A Head that also reads an encoded trajectory."""
+    """A Head that also reads an encoded trajectory and, where it gets the points around the contact [..., 3 K], what
+    the hand at the start sees of them."""
 
     config: NetworksConfig
     widths: tuple[int, ...]
 
     @nn.compact
     def __call__(
-        self, trajectory: jax.Array, f: jax.Array, contact: jax.Array, task: jax.Array, *course: jax.Array
+        self,
+        trajectory: jax.Array,
+        f: jax.Array,
+        contact: jax.Array,
+        task: jax.Array,
+        *course: jax.Array,
+        around: jax.Array | None = None,
     ) -> jax.Array:
         parts = [trajectory * jnp.array(SCALE)]
         moved = since_start(trajectory)[..., :3]
@@ -272,8 +289,12 @@ class TrajectoryHead(nn.Module):
         x = jnp.concatenate([jnp.broadcast_to(part, (*leading, part.shape[-1])) for part in parts], -1)
         for width in self.config.trajectory[:-1]:
             x = nn.leaky_relu(nn.Dense(width)(x))
-        x = nn.Dense(self.config.trajectory[-1])(x)
-        return Head(self.config, self.widths)(f, contact, task, *course, x)
+        more = [nn.Dense(self.config.trajectory[-1])(x)]
+        if around is not None:
+            points = around.reshape(*around.shape[:-1], around.shape[-1] // 3, 3)
+            seen = HAND_SCALE * points @ matrix_from_rot6d(trajectory[..., :6])
+            more.append(Shared(self.config.hand, name="hand")(seen).max(-2))
+        return Head(self.config, self.widths)(f, contact, task, *course, *more)
 
 
 def places_and_turn(course: jax.Array) -> tuple[jax.Array, jax.Array]:

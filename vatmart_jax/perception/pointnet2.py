@@ -188,6 +188,19 @@ def group(points: jax.Array, queries: jax.Array, config: PointNetConfig) -> Grou
     return Grouping(queries, tuple(centroids), tuple(neighbours), tuple(nearest), tuple(weights), around)
 
 
+def surroundings(points: jax.Array, grouping: Grouping, which: jax.Array | None = None) -> jax.Array:
+    """Offsets [Q, 3 K] from queries (`which` [Q] of them, None for all) to the points of all their groups.
+
+    points: [N, 3].
+    """
+    members = jnp.concatenate(grouping.around, -1)
+    queries = grouping.queries
+    if which is not None:
+        members, queries = _take(members, which), _take(queries, which)
+    offsets = _take(points.astype(jnp.float32), members) - queries[:, None]
+    return offsets.reshape(len(offsets), -1)
+
+
 class Shared(nn.Module):
     """Dense layers with ReLU, the same for every point [..., d] -> [..., widths[-1]].
 
