@@ -24,7 +24,7 @@ from vatmart_jax.perception.networks import (
     pack_course,
     places_and_turn,
 )
-from vatmart_jax.perception.pointnet2 import Level, PointNetConfig
+from vatmart_jax.perception.pointnet2 import Around, Level, PointNetConfig, group
 from vatmart_jax.perception.transform import Transform, spread
 from vatmart_jax.presets import PRESETS
 
@@ -277,6 +277,28 @@ def test_an_ensemble_says_the_mean_over_copies_of_what_it_proposes_for_the_view(
     alone, _ = Ensemble(networks).propose(params, Features(*(x[:1] for x in f)), contact, task, jax.random.key(1), 8)
     close(proposed, alone)
     close(said[2], ensemble.score(params, Features(*(x[:, 2, None] for x in f)), contact[2], task[2], proposed[2]))
+
+
+def test_the_hand_sees_the_points_around_the_contact_as_they_lie(world, data) -> None:
+    clouds, around = world[0], replace(TINY, around=(Around(0.3, 8, (16,)), Around(0.6, 4, (16,))))
+    points, which = clouds.points[0].astype(jnp.float32), jnp.array([3, 0])
+    grouping = group(points, clouds.contacts[0], around)
+    networks = Networks(NetworksConfig(pointnet=around, hand=(8, 16)))
+    params = networks.init(jax.random.key(0))
+    f = jax.jit(networks.features)(params, points, grouping, which)
+    members = np.concatenate([np.asarray(a)[which] for a in grouping.around], -1)
+    offsets = np.asarray(points)[members] - np.asarray(clouds.contacts[0])[which][:, None]
+    np.testing.assert_allclose(f.around.reshape(2, 12, 3), offsets, atol=1e-6)
+    contact, task, trajectory = clouds.contacts[0, which], jnp.full(2, 0.3), data.trajectory[:2]
+    said = networks.score(params, f, contact, task, trajectory)
+    seen = lambda points: networks.score(params, f._replace(around=points.reshape(2, 36)), contact, task, trajectory)  # noqa: E731
+    np.testing.assert_allclose(seen(offsets[:, ::-1]), said, rtol=1e-4, atol=1e-5)  # in whatever order
+    assert np.abs(seen(offsets[..., [1, 2, 0]]) - said).min() > 1e-4  # but not lying otherwise to the hand
+
+
+def test_a_hand_needs_groups_to_see() -> None:
+    with pytest.raises(ValueError, match="give it some, or leave out `hand`"):
+        NetworksConfig(pointnet=TINY, hand=(8,))
 
 
 def test_disturbed_courses_are_off_by_the_share_asked_for() -> None:
