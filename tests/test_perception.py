@@ -294,6 +294,14 @@ def test_the_hand_sees_the_points_around_the_contact_as_they_lie(world, data) ->
     seen = lambda points: networks.score(params, f._replace(around=points.reshape(2, 36)), contact, task, trajectory)  # noqa: E731
     np.testing.assert_allclose(seen(offsets[:, ::-1]), said, rtol=1e-4, atol=1e-5)  # in whatever order
     assert np.abs(seen(offsets[..., [1, 2, 0]]) - said).min() > 1e-4  # but not lying otherwise to the hand
+    # It is the hand's frame: where nothing else reads the trajectory, points that turn with it look the same.
+    params["scorer"]["Dense_0"]["kernel"] *= 0
+    turn = g.matrix_from_rotvec(jnp.array([0.5, -0.3, 0.8]))
+    start, residuals = g.unpack_trajectory(trajectory)
+    turned = g.pack_trajectory(turn @ start, residuals)
+    score = lambda points, t: networks.score(params, f._replace(around=points.reshape(2, 36)), contact, task, t)  # noqa: E731
+    np.testing.assert_allclose(score(offsets @ turn.T, turned), score(offsets, trajectory), rtol=1e-4, atol=1e-5)
+    assert np.abs(score(offsets, turned) - score(offsets, trajectory)).min() > 1e-4
 
 
 def test_a_hand_needs_groups_to_see() -> None:

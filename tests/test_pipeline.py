@@ -7,6 +7,7 @@ from pathlib import Path
 import jax
 import numpy as np
 import pytest
+from flax import serialization
 
 from vatmart_jax.config import from_json, to_json
 from vatmart_jax.data import Data
@@ -21,7 +22,7 @@ from vatmart_jax.perception.train import PerceptionConfig
 from vatmart_jax.physics import PhysicsConfig
 from vatmart_jax.pipeline.explore import ExploreConfig
 from vatmart_jax.pipeline.run import Run, RunError, read_metrics
-from vatmart_jax.pipeline.train import perception_config
+from vatmart_jax.pipeline.train import Training, perception_config
 from vatmart_jax.presets import PRESETS, EvaluationConfig, Schedule, Settings, default_preset
 from vatmart_jax.rl.td3 import TD3Config
 from vatmart_jax.training import resolve, train
@@ -125,6 +126,15 @@ def test_failures_are_told_apart(converted, task):
     row = downstream(env, random_method(env), 48, jax.random.key(0))
     assert row["success"] + row["in_collision"] + row["lost_grip"] <= 1
     assert row["no_grasp"] <= row["lost_grip"] and (row["no_grasp"] > 0) == (task == "pull-drawer")
+
+
+def test_a_run_keeps_the_running_mean_of_its_policy(finished, converted):
+    out, _ = finished
+    env = Data(converted).env("train", TASKS["push-drawer"], "c", TINY.env, TINY.physics)
+    with Run(out, resolve("push-drawer", "quick", "c", 0, TINY, converted)) as run:
+        td3 = Training(run, env, TINY, 0, lambda *_: None).train().explore.td3
+    assert (out / "policy.msgpack").read_bytes() == serialization.to_bytes(jax.device_get(td3.target_policy))
+    assert any(np.any(a != b) for a, b in zip(*map(jax.tree.leaves, (td3.policy, td3.target_policy)), strict=True))
 
 
 @pytest.mark.parametrize("stage, done", [("explore", 2), ("scorer", 3)])

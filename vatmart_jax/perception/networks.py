@@ -33,7 +33,7 @@ Params = dict  # of the networks' names to their Flax parameters
 TASK_SCALE = 3.0
 MOVE_SCALE = 5.0
 TURN_SCALE = 2.0
-HAND_SCALE = 10.0  # points around the contact lie within 0.15 unit lengths of it
+HAND_SCALE = 10.0  # of where points around the contact are, within 0.15 unit lengths of it in the presets
 COURSE = 3 * WAYPOINTS + 3
 AXIS_AND_ARM = 6
 SCALE = (1.0,) * 6 + ((MOVE_SCALE,) * 3 + (TURN_SCALE,) * 3) * WAYPOINTS  # of the 30 numbers of a trajectory
@@ -147,7 +147,9 @@ class Networks:
         """
         encode = lambda name: PointNet2(self.config.pointnet).apply({"params": params[name]}, points, grouping, which)  # noqa: E731
         found = [encode(name) for name in self.encoders("scorer", "proposal", "actionability")]
-        around = surroundings(points, grouping, which) if self.config.hand else jnp.zeros((len(found[0]), 0))
+        around = jnp.zeros((len(found[0]), 0))
+        if self.config.hand:
+            around = jnp.concatenate(surroundings(points, grouping, which), -2).reshape(len(around), -1)
         return Features(*(found if self.config.separate else found * 3), around)  # pyright: ignore[reportArgumentType, reportCallIssue]
 
     def score(

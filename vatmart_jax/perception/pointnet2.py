@@ -188,17 +188,14 @@ def group(points: jax.Array, queries: jax.Array, config: PointNetConfig) -> Grou
     return Grouping(queries, tuple(centroids), tuple(neighbours), tuple(nearest), tuple(weights), around)
 
 
-def surroundings(points: jax.Array, grouping: Grouping, which: jax.Array | None = None) -> jax.Array:
-    """Offsets [Q, 3 K] from queries (`which` [Q] of them, None for all) to the points of all their groups.
+def surroundings(points: jax.Array, grouping: Grouping, which: jax.Array | None = None) -> tuple[jax.Array, ...]:
+    """Offsets [Q, k, 3] from queries to the points of each group about them.
 
-    points: [N, 3].
+    points: [N, 3]. which: [Q] int into the queries, None for all.
     """
-    members = jnp.concatenate(grouping.around, -1)
-    queries = grouping.queries
-    if which is not None:
-        members, queries = _take(members, which), _take(queries, which)
-    offsets = _take(points.astype(jnp.float32), members) - queries[:, None]
-    return offsets.reshape(len(offsets), -1)
+    of_query = (lambda x: x) if which is None else (lambda x: _take(x, which))
+    place = of_query(grouping.queries)[:, None]
+    return tuple(_take(points.astype(jnp.float32), of_query(members)) - place for members in grouping.around)
 
 
 class Shared(nn.Module):
@@ -244,9 +241,8 @@ class PointNet2(nn.Module):
             spread = jnp.sum(_take(features, nearest) * weights[..., None].astype(jnp.float32), -2)
             features = Shared(self.config.propagation[depth])(jnp.concatenate([spread, skips[depth]], -1))
         parts = [features]
-        for kind, members in zip(self.config.around, grouping.around, strict=True):
-            members = members if which is None else _take(members, which)
-            offset = (_take(points.astype(jnp.float32), members) - skips[0][:, None]) / kind.radius
+        for kind, offset in zip(self.config.around, surroundings(points, grouping, which), strict=True):
+            offset = offset / kind.radius
             # A query with no point near has one from elsewhere, at a distance that means nothing.
             inside = jnp.sum(offset**2, -1, keepdims=True) <= 1.01
             parts.append(jnp.where(inside, Shared(kind.widths)(offset), 0.0).max(-2))
