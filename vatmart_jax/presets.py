@@ -77,6 +77,7 @@ _ON_CPU = PerceptionConfig(
     probes=4,
     proposals=32,
     best=2,
+    learning_rate=2e-3,
 )
 
 PRESETS = {
@@ -84,8 +85,7 @@ PRESETS = {
     "cpu": Settings(
         explore=ExploreConfig(iterations=100, pool=4096),
         perception=replace(
-            _ON_CPU, learning_rate=2e-3,
-            networks=replace(_ON_CPU.networks, pointnet=replace(SMALL, context=(64, 128))),
+            _ON_CPU, networks=replace(_ON_CPU.networks, pointnet=replace(SMALL, context=(64, 128)))
         ),
         schedule=Schedule(
             samples=400_000, collect=128, course=6000, scorer=200, proposal=2000, actionability=200, finetune=16,
@@ -111,7 +111,7 @@ PRESETS = {
         ),
         perception=PerceptionConfig(
             networks=NetworksConfig(separate=True, positions=False), views=8, queries=4, probes=4,
-            mirror=False, yaw=0.0, scale=0.0, kl_free=0.0,
+            mirror=False, yaw=0.0, scale=0.0, kl_free=0.0, muon=False,
         ),
         schedule=Schedule(
             samples=20_000, collect=160, scorer=16_000, proposal=35_000, actionability=5000, curiosity=1500,

@@ -16,6 +16,7 @@ import jax
 import jax.numpy as jnp
 import optax
 from flax import struct
+from optax.contrib import muon
 
 from vatmart_jax.geometry import WAYPOINTS
 from vatmart_jax.perception import losses
@@ -104,6 +105,8 @@ class PerceptionConfig:
     """drawers: tasks grow with the view, parts move along their axis and do not turn"""
     learning_rate: float = 1e-3
     """after 100 steps of warm-up; falls along a cosine to a fiftieth at the stage's end"""
+    muon: bool = True
+    """Muon for all matrices: their momentum made orthogonal, at the size of Adam's steps; the paper has Adam"""
     weight_decay: float = 1e-4
     """decoupled, as in AdamW"""
     score_weight: float = 5.0
@@ -407,9 +410,12 @@ def _trained(config: PerceptionConfig, stage: str) -> set[str]:
 
 
 def _optimizer(config: PerceptionConfig) -> optax.GradientTransformation:
-    decay = optax.add_decayed_weights(config.weight_decay)
+    """Its updates are to be subtracted, times the learning rate."""
+    clip, decay = optax.clip_by_global_norm(1.0), optax.add_decayed_weights(config.weight_decay)
+    if config.muon:  # it subtracts by itself, hence -1; Adam's updates have an RMS of 1 at first, of about 0.2 later
+        return optax.chain(clip, muon(-1.0, consistent_rms=0.5), decay)
     # As one vector: an update per parameter compiles twice as long.
-    return optax.flatten(optax.chain(optax.clip_by_global_norm(1.0), optax.scale_by_adam(), decay))
+    return optax.flatten(optax.chain(clip, optax.scale_by_adam(), decay))
 
 
 @partial(jax.jit, static_argnames=("config",))
