@@ -89,7 +89,7 @@ PRESETS = {
         ),
         schedule=Schedule(
             samples=400_000, collect=128, course=6000, scorer=200, proposal=2000, actionability=200, finetune=16,
-            finetune_batches=64, finetune_steps=1500,
+            finetune_batches=64, finetune_steps=1500, finetune_rate=4e-4,
         ),
     ),
     "gpu": Settings(
