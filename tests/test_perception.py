@@ -324,7 +324,7 @@ def test_disturbed_courses_are_off_by_the_share_asked_for() -> None:
 def test_a_course_can_be_learned_and_is_asked_for_labels(world, data, hinge: bool) -> None:
     # These clouds do not tell a scene from its mirror image, in which a hinge turns the other way.
     networks = replace(COURSE.networks, hinge=hinge)
-    config = replace(COURSE, task_is_length=not hinge, mirror=False, networks=networks, learning_rate=2e-3)
+    config = replace(COURSE, task_is_length=not hinge, mirror=False, networks=networks)
     clouds, fresh = world[0], t.begin(jax.random.key(0), config)
     with pytest.raises(ValueError, match="the clouds come without joints"):
         t.train(fresh, clouds, data, config, "course", 1)

@@ -77,7 +77,6 @@ _ON_CPU = PerceptionConfig(
     probes=4,
     proposals=32,
     best=2,
-    learning_rate=2e-3,
 )
 
 PRESETS = {
@@ -88,7 +87,7 @@ PRESETS = {
             _ON_CPU, networks=replace(_ON_CPU.networks, pointnet=replace(SMALL, context=(64, 128)))
         ),
         schedule=Schedule(
-            samples=400_000, collect=128, course=6000, scorer=200, proposal=2000, actionability=200, finetune=16,
+            samples=400_000, collect=128, course=4000, scorer=200, proposal=2000, actionability=200, finetune=8,
             finetune_batches=64, finetune_steps=1500, finetune_rate=4e-4,
         ),
     ),
@@ -111,7 +110,7 @@ PRESETS = {
         ),
         perception=PerceptionConfig(
             networks=NetworksConfig(separate=True, positions=False), views=8, queries=4, probes=4,
-            mirror=False, yaw=0.0, scale=0.0, kl_free=0.0, muon=False,
+            mirror=False, yaw=0.0, scale=0.0, kl_free=0.0, learning_rate=1e-3, muon=False,
         ),
         schedule=Schedule(
             samples=20_000, collect=160, scorer=16_000, proposal=35_000, actionability=5000, curiosity=1500,

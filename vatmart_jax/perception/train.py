@@ -103,7 +103,7 @@ class PerceptionConfig:
     """augmentation: views, and what happens in them, grow or shrink by up to this share"""
     task_is_length: bool = False
     """drawers: tasks grow with the view, parts move along their axis and do not turn"""
-    learning_rate: float = 1e-3
+    learning_rate: float = 2e-3
     """after 100 steps of warm-up; falls along a cosine to a fiftieth at the stage's end"""
     muon: bool = True
     """Muon for all matrices: their momentum made orthogonal, at the size of Adam's steps; the paper has Adam"""
