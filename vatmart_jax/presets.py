@@ -84,7 +84,7 @@ PRESETS = {
     "cpu": Settings(
         explore=ExploreConfig(iterations=100, pool=4096),
         perception=replace(
-            _ON_CPU, networks=replace(_ON_CPU.networks, pointnet=replace(SMALL, context=(64, 128)))
+            _ON_CPU, networks=replace(_ON_CPU.networks, pointnet=replace(SMALL, context=(64, 128))), encoder_rate=0.25
         ),
         schedule=Schedule(
             samples=400_000, collect=128, course=4000, scorer=200, proposal=2000, actionability=200, finetune=8,
