@@ -349,7 +349,14 @@ def test_a_stage_changes_only_what_it_trains(world, data, fresh, stage: str, res
     assert resting <= same and same != set(fresh.params)
 
 
-@pytest.mark.parametrize(("stage", "resting"), [("proposal", {"encoder", "course", "actionability"}), ("joint", set())])
+@pytest.mark.parametrize(
+    ("stage", "resting"),
+    [
+        ("scorer", {"encoder", "course", "posterior", "decoder", "actionability"}),
+        ("proposal", {"encoder", "course", "actionability"}),
+        ("joint", set()),
+    ],
+)
 def test_encoder_and_course_learn_at_their_own_rate_beside_fresh_heads(world, data, stage: str, resting) -> None:
     config = replace(COURSE, encoder_rate=0.0)
     fresh, along = t.begin(jax.random.key(0), config), jnp.broadcast_to(jnp.array([0.0, 0.6, 0.8]), (len(world[0]), 3))

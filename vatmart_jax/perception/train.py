@@ -106,8 +106,8 @@ class PerceptionConfig:
     learning_rate: float = 2e-3
     """after 100 steps of warm-up; falls along a cosine to a fiftieth at the stage's end"""
     encoder_rate: float = 1.0
-    """share of that for encoder and course in the stages `scorer` and `proposal`, whose fresh heads undo some of what a
-    long `course` stage has taught them"""
+    """share of that for encoder and course, where there is one, in the stages `scorer` and `proposal`, whose fresh
+    heads undo some of what a long `course` stage has taught them"""
     muon: bool = True
     """Muon for all matrices: their momentum made orthogonal, at the size of Adam's steps; the paper has Adam"""
     weight_decay: float = 1e-4
@@ -458,7 +458,7 @@ def _steps(
         gradients = {name: gradients.get(name, jax.tree.map(jnp.zeros_like, p)) for name, p in state.params.items()}
         updates, optimizer = _optimizer(config).update(gradients, state.optimizer, state.params)
         rate = _learning_rate(config, state.step, steps)
-        updates = {name: optax.tree.scale(shares[name], updates[name]) for name in part}  # pyright: ignore
+        updates = {name: optax.tree.scale(shares[name], updates[name]) for name in part}  # pyright: ignore[reportIndexIssue, reportOptionalSubscript]
         moved = jax.tree.map(lambda p, u: p - rate * u, part, updates)
         return PerceptionState(state.params | moved, optimizer, state.step + 1, jax.random.key_data(key)), metrics
 
