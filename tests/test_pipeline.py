@@ -74,6 +74,7 @@ def test_a_run_leaves_everything_its_readers_need(finished):
     assert not list(out.rglob("*.part"))
     assert set(result["success"]) == {"test_shapes", "test_categories"}
     assert {row["method"] for row in result["results"]} == {"ours", "random"}
+    assert all(seconds > 0 for seconds in result["stages"].values()) and {"compile", "evaluate"} < set(result["stages"])
     stages = [line["stage"] for line in read_metrics(out)]
     assert list(dict.fromkeys(stages)) == [
         "explore", "collect", "course", "scorer", "proposal", "actionability", "curiosity", "finetune",

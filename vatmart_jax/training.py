@@ -22,6 +22,7 @@ from vatmart_jax.files import write_bytes, write_json
 from vatmart_jax.inference import Priors, PriorsConfig
 from vatmart_jax.physics.interface import IMPLS
 from vatmart_jax.pipeline import pictures
+from vatmart_jax.pipeline.clock import Clock
 from vatmart_jax.pipeline.run import Run, read_metrics
 from vatmart_jax.pipeline.train import Report, Training, perception_config, run_seconds
 from vatmart_jax.presets import Settings
@@ -66,14 +67,15 @@ def train(
         policy = progress.explore.td3.target_policy  # a running mean, which succeeds more often than the last step
         write_bytes(out / "policy.msgpack", serialization.to_bytes(jax.device_get(policy)))
         tests = {split: env for split, env in envs.items() if split != "train"}
-        evaluated = time.monotonic()
+        clock = Clock()
         results = []
         for number, (split, env) in enumerate(tests.items()):
             results += evaluate_split(
                 split, env, priors, ("ours", "random"), settings.evaluation.trials,
                 settings.evaluation.proposals, training.key("evaluate", number), report,
             )  # fmt: skip
-        seconds = run_seconds(progress) | {"evaluate": round(time.monotonic() - evaluated, 1)}
+        lap, seconds = clock.lap(), run_seconds(progress)
+        seconds |= {"evaluate": round(lap.working, 1), "compile": round(seconds["compile"] + lap.compiling, 1)}
         table = markdown([{"task": task.name, **row} for row in results])
         pictures.curves(read_metrics(out), out / "curves.png")
         pictures.contact_sheet([data.folder / i / "picture.png" for i in _objects(envs)], out / "objects.png")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
@@ -14,12 +13,13 @@ import numpy as np
 from flax import struct
 
 from vatmart_jax.bank import HINGE, SLIDE
-from vatmart_jax.env import Env, Start, Task
+from vatmart_jax.env import Env, EnvState, Start, Task
 from vatmart_jax.perception import train as perception
 from vatmart_jax.perception.ask import Ensemble, score_trajectories
 from vatmart_jax.perception.clouds import Clouds, clouds_of, points_of
 from vatmart_jax.perception.networks import Networks
 from vatmart_jax.perception.train import PerceptionConfig, PerceptionState, Samples
+from vatmart_jax.pipeline.clock import Clock
 from vatmart_jax.pipeline.collect import ProposalTrials, curious, samples_of
 from vatmart_jax.pipeline.explore import Explorer, ExploreState, start_pool
 from vatmart_jax.pipeline.run import Run
@@ -41,7 +41,7 @@ class Progress:
     stored: jax.Array  # [] int32, samples ever
     stage: jax.Array  # [] int32, index into STAGES
     done: jax.Array  # [] int32, units of that stage
-    seconds: jax.Array  # [len(STAGES)] spent per stage, restarts included
+    seconds: jax.Array  # [len(STAGES) + 1] spent per stage and, last, compiling; restarts included
 
     def with_samples(self, new: Samples) -> Progress:
         """Trials stored, in place of the oldest where the buffer is full."""
@@ -57,10 +57,11 @@ class Training:
         self.config = perception_config(settings, env.task)
         self._ensemble = Ensemble(Networks(self.config.networks))
         self._explorer = Explorer(env, settings.explore)
+        self._execute = jax.jit(env.execute)
         self._pool: Start | None = None
         self._clouds: Clouds | None = None
         self._score = partial(score_trajectories, self._ensemble)
-        self._begun = time.monotonic()
+        self._clock = Clock()
         points_of(env.views, self.config.networks.pointnet)  # too few: said before hours of exploration
 
     def key(self, purpose: str, index: int | jax.Array = 0) -> jax.Array:
@@ -76,7 +77,7 @@ class Training:
             stored=jnp.int32(0),
             stage=jnp.int32(0),
             done=jnp.int32(0),
-            seconds=jnp.zeros(len(STAGES)),
+            seconds=jnp.zeros(len(STAGES) + 1),
         )
 
     def train(self, begun: Progress | None = None) -> Progress:
@@ -86,7 +87,7 @@ class Training:
         """
         progress = self._run.restore(begun or self.beginning())
         for stage in range(int(progress.stage), len(STAGES)):
-            self._begun = time.monotonic()
+            self._clock.lap()
             progress = getattr(self, f"_{STAGES[stage]}")(progress)
             progress = self._timed(progress).replace(stage=jnp.int32(stage + 1), done=jnp.int32(0))
             self._run.save(progress)
@@ -122,9 +123,13 @@ class Training:
         return progress
 
     def _timed(self, progress: Progress) -> Progress:
-        now = time.monotonic()
-        spent, self._begun = now - self._begun, now
-        return progress.replace(seconds=progress.seconds.at[progress.stage].add(spent))
+        lap = self._clock.lap()
+        seconds = progress.seconds.at[progress.stage].add(lap.working).at[-1].add(lap.compiling)
+        return progress.replace(seconds=seconds)
+
+    def _acted_out(self, final: EnvState) -> Samples:
+        """The samples that the policy's trials make. These stop at success; executed, a trajectory has no such end."""
+        return samples_of(self._execute(final.start, final.residuals))
 
     def _explore(self, progress: Progress) -> Progress:
         total = self._settings.explore.iterations
@@ -133,7 +138,7 @@ class Training:
             state, final, metrics = self._explorer.iterate(progress.explore, self.pool(), None)
             progress = progress.replace(explore=state)
             if done >= late:
-                progress = progress.with_samples(samples_of(final))
+                progress = progress.with_samples(self._acted_out(final))
             progress = self._tick(progress, "explore", done + 1, total, metrics)
         return progress
 
@@ -142,7 +147,7 @@ class Training:
         for done in range(int(progress.done), schedule.collect):
             final, _ = self._explorer.run(
                 progress.explore.td3.policy, None, self.key("collect", done), schedule.collect_noise, 0.0,
-                schedule.collect_expert, abandon=False,
+                schedule.collect_expert, stop=False,
             )  # fmt: skip
             samples = samples_of(final)
             metrics = {
@@ -202,7 +207,7 @@ class Training:
             metrics: dict[str, Any] = {}
             for _ in range(schedule.curiosity_iterations):
                 state, final, metrics = self._explorer.iterate(progress.explore, self.pool(), penalty)
-                found = samples_of(final)
+                found = self._acted_out(final)
                 score = self._score(params, self.clouds(), found.view, found.contact, found.task, found.trajectory)
                 surprising = curious(found, score, self._env.config.tolerance)
                 progress = progress.replace(explore=state).with_samples(surprising)
@@ -256,8 +261,8 @@ def _curiosity_penalty(ensemble: Ensemble, params: Any, clouds: Clouds, weight: 
 
 
 def run_seconds(progress: Progress) -> dict[str, float]:
-    """Seconds per stage."""
-    return {stage: round(float(s), 1) for stage, s in zip(STAGES, progress.seconds, strict=True)}
+    """Seconds per stage, less those of compiling, which are all in `compile`."""
+    return {stage: round(float(s), 1) for stage, s in zip((*STAGES, "compile"), progress.seconds, strict=True)}
 
 
 __all__ = ["STAGES", "Progress", "Training", "perception_config", "run_seconds"]
