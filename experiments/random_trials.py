@@ -65,13 +65,13 @@ def main(args: RandomTrials) -> None:
 
 
 def _trials(env: Env, key: jax.Array) -> dict[str, jax.Array]:
-    """Counts over one batch. Trials go on after a lost grip; while the task is done, the hand stays where it is."""
+    """Counts over one batch. Trials go on after a success or a lost grip: random actions all the way."""
     k_reset, k_policy = jax.random.split(key)
     begun = env.reset(k_reset)
 
     def step(state, key):
         action = jax.random.uniform(key, (len(state.done), ACTION), minval=-1, maxval=1)
-        state = env.step(state, action, stop=False)
+        state = env.step(state, action, abandon=False)
         return state, _not_finite(state)
 
     final, bad = jax.lax.scan(step, begun, jax.random.split(k_policy, WAYPOINTS))

@@ -1,5 +1,4 @@
 from dataclasses import replace
-from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -28,7 +27,6 @@ class Run:
     def __init__(self, cabinets: tuple[SceneBank, ViewBank], task: str):
         self.env = Env(*cabinets, TASKS[task], config=EnvConfig(batch=BATCH))
         self.reset, self.step = jit(self.env.reset), jit(self.env.step)
-        self.go_on = jit(partial(self.env.step, stop=False))
         self.begin, self.execute = jit(self.env.begin), jit(self.env.execute)
         self.sample = jit(lambda key: self.env.sample(key, 5000))
 
@@ -332,23 +330,6 @@ def test_a_recorded_trajectory_repeats_the_motion_and_is_zero_after_the_end(runs
     again = run.execute(state.start.replace(rotation=frames), residuals)
     for k in range(g.WAYPOINTS):
         np.testing.assert_allclose(again.progress[ends > k, k], state.progress[ends > k, k], atol=1e-3)
-
-
-@pytest.mark.parametrize("task", ["push-door", "pull-drawer"])
-def test_a_trial_that_does_not_stop_is_what_executing_its_trajectory_does(runs, task):
-    run = runs(task)
-    pulling = task.startswith("pull")
-    state = run.begin(run.starts(slice(8, 16) if pulling else slice(8), [0, 1, 0.1] if pulling else [0, 0, 1], 0.15))
-    rested = np.zeros(BATCH, bool)
-    for k in range(g.WAYPOINTS):
-        before, state = state, run.go_on(state, 1.4 * run.expert(state) + 0.1 * random_actions(k))
-        still = (state.residuals[:, k] == 0).all(-1)
-        np.testing.assert_array_equal(still[before.valid], before.success[before.valid])
-        rested |= np.asarray(before.success)
-    assert rested.any() and (state.done == (state.waypoint == g.WAYPOINTS)).all()
-    again = run.execute(state.start, state.residuals)
-    np.testing.assert_allclose(again.progress[state.valid], state.progress[state.valid], atol=1e-3)
-    np.testing.assert_array_equal(again.success, state.success)
 
 
 def test_open_loop_trials_count_only_how_they_end(runs):

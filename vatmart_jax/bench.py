@@ -244,7 +244,7 @@ def random_trials(env: Env, start: Start, key: jax.Array) -> EnvState:
 
     def step(state: EnvState, key: jax.Array) -> tuple[EnvState, None]:
         action = expert_action(env, state)
-        return env.step(state, action + NOISE * jax.random.normal(key, action.shape), stop=False), None
+        return env.step(state, action + NOISE * jax.random.normal(key, action.shape), abandon=False), None
 
     return jax.lax.scan(step, env.begin(start), jax.random.split(key, WAYPOINTS))[0]
 

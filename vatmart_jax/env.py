@@ -320,11 +320,10 @@ class Env:
         shares = jnp.arange(1, g.WAYPOINTS + 1) / g.WAYPOINTS
         return jax.lax.map(lambda share: self.is_free(start, amount=share * longest), shares).all(0)
 
-    def step(self, state: EnvState, action: jax.Array, stop: bool = True) -> EnvState:
+    def step(self, state: EnvState, action: jax.Array, abandon: bool = True) -> EnvState:
         """One waypoint from an action [B, 6] in [-1, 1]: move of the fingertips and turn (rotation vector) of the
-        hand, both in the joint-local frame. Trials that are done stay as they are; one is done after four waypoints
-        and, with `stop`, when it succeeds or cannot any more (lost grip, unsound physics). Without, it goes on as
-        executing its trajectory does, and the hand is told to stay where it is while the task is done.
+        hand, both in the joint-local frame. Trials that are done stay as they are; one is done when it succeeds,
+        after four waypoints and, with `abandon`, once it cannot succeed any more (lost grip, unsound physics).
         """
         config = self.config
         move = g.rotate(state.frame, action[:, :3] * config.move_range)
@@ -336,9 +335,9 @@ class Env:
         vector = vector * jnp.minimum(1.0, config.turn_limit / jnp.maximum(angle, 1e-6))
         euler = g.euler_from_matrix(into @ g.matrix_from_rotvec(vector) @ into.swapaxes(-1, -2))
         residual = jnp.concatenate([move, euler - state.euler], -1)
-        state = self._advance(state, jnp.where(state.success[:, None], 0.0, residual))
-        ended = state.success | ~(state.valid & state.held)
-        return state.replace(done=state.done | (ended & stop))
+        state = self._advance(state, residual)
+        lost = ~(state.valid & state.held) & abandon
+        return state.replace(done=state.done | state.success | lost)
 
     def execute(self, start: Start, residuals: jax.Array) -> EnvState:
         """Whole trials, open loop, never stopped early: residuals [B, 4, 6] as `geometry.pack_trajectory` has them.

@@ -31,7 +31,7 @@ def labelled(explorer: Explorer, policy: Any, count: int, key: jax.Array) -> tup
     bad: list[Samples] = []
     found = 0
     for batch in range(40):
-        final, _ = explorer.run(policy, None, jax.random.fold_in(key, batch), _NOISE, 0.0, stop=False)
+        final, _ = explorer.run(policy, None, jax.random.fold_in(key, batch), _NOISE, 0.0, abandon=False)
         samples = jax.device_get(samples_of(final))
         success = np.asarray(samples.success(tolerance))
         good.append(jax.tree.map(lambda a: a[success], samples))  # noqa: B023

@@ -54,7 +54,7 @@ class Explorer:
         self.env, self.config = env, config
         self.td3 = TD3(config.td3, OBSERVATION, ACTION)
         self.iterate = jax.jit(self._iterate)
-        self.run = jax.jit(self._run, static_argnames="stop")
+        self.run = jax.jit(self._run, static_argnames="abandon")
 
     def init(self, key: jax.Array) -> ExploreState:
         """Consumes the key."""
@@ -63,17 +63,17 @@ class Explorer:
         return ExploreState(self.td3.init(kt), replay, ks, jnp.zeros((), jnp.int32))
 
     def _run(
-        self, policy, pool: Start | None, key: jax.Array, noise, random, expert: Any = 0.0, stop: bool = True
+        self, policy, pool: Start | None, key: jax.Array, noise, random, expert: Any = 0.0, abandon: bool = True
     ) -> tuple[EnvState, Episode]:
         """One batch of trials; from the pool if there is one, else from random starts. Consumes the key.
 
         noise: share of the action range; random: share of uniform actions; expert: share of trials that the scripted
-        expert makes, with the same noise. Without `stop` all trials are acted out, those that cannot succeed too: what
-        perception learns from them is what executing their trajectories does.
+        expert makes, with the same noise. Without `abandon` trials that cannot succeed are acted out too: perception
+        learns from them.
         """
         kr, ke = jax.random.split(key)
         begun = self.env.reset(kr, pool)
-        if not stop:
+        if not abandon:
             begun = begun.replace(done=jnp.zeros_like(begun.done))
 
         def step(state: EnvState, key: jax.Array):
@@ -82,7 +82,7 @@ class Explorer:
             shown = expert_action(self.env, state)
             shown = jnp.clip(shown + noise * jax.random.normal(kx, shown.shape), -1, 1)
             action = jnp.where(jnp.arange(len(action))[:, None] < expert * len(action), shown, action)
-            after = self.env.step(state, action, stop)
+            after = self.env.step(state, action, abandon)
             record = Episode(
                 state.obs, action, after.reward, after.obs, after.done, ~state.done & ~after.physics.diverged,
                 state.moved, after.moved, after.info["tip_distance"], after.held,

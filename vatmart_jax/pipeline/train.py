@@ -13,7 +13,7 @@ import numpy as np
 from flax import struct
 
 from vatmart_jax.bank import HINGE, SLIDE
-from vatmart_jax.env import Env, EnvState, Start, Task
+from vatmart_jax.env import Env, Start, Task
 from vatmart_jax.perception import train as perception
 from vatmart_jax.perception.ask import Ensemble, score_trajectories
 from vatmart_jax.perception.clouds import Clouds, clouds_of, points_of
@@ -57,7 +57,6 @@ class Training:
         self.config = perception_config(settings, env.task)
         self._ensemble = Ensemble(Networks(self.config.networks))
         self._explorer = Explorer(env, settings.explore)
-        self._execute = jax.jit(env.execute)
         self._pool: Start | None = None
         self._clouds: Clouds | None = None
         self._score = partial(score_trajectories, self._ensemble)
@@ -127,10 +126,6 @@ class Training:
         seconds = progress.seconds.at[progress.stage].add(lap.working).at[-1].add(lap.compiling)
         return progress.replace(seconds=seconds)
 
-    def _acted_out(self, final: EnvState) -> Samples:
-        """The samples that the policy's trials make. These stop at success; executed, a trajectory has no such end."""
-        return samples_of(self._execute(final.start, final.residuals))
-
     def _explore(self, progress: Progress) -> Progress:
         total = self._settings.explore.iterations
         late = round(self._settings.schedule.late_share * total)
@@ -138,7 +133,7 @@ class Training:
             state, final, metrics = self._explorer.iterate(progress.explore, self.pool(), None)
             progress = progress.replace(explore=state)
             if done >= late:
-                progress = progress.with_samples(self._acted_out(final))
+                progress = progress.with_samples(samples_of(final))
             progress = self._tick(progress, "explore", done + 1, total, metrics)
         return progress
 
@@ -147,7 +142,7 @@ class Training:
         for done in range(int(progress.done), schedule.collect):
             final, _ = self._explorer.run(
                 progress.explore.td3.policy, None, self.key("collect", done), schedule.collect_noise, 0.0,
-                schedule.collect_expert, stop=False,
+                schedule.collect_expert, abandon=False,
             )  # fmt: skip
             samples = samples_of(final)
             metrics = {
@@ -207,7 +202,7 @@ class Training:
             metrics: dict[str, Any] = {}
             for _ in range(schedule.curiosity_iterations):
                 state, final, metrics = self._explorer.iterate(progress.explore, self.pool(), penalty)
-                found = self._acted_out(final)
+                found = samples_of(final)
                 score = self._score(params, self.clouds(), found.view, found.contact, found.task, found.trajectory)
                 surprising = curious(found, score, self._env.config.tolerance)
                 progress = progress.replace(explore=state).with_samples(surprising)
