@@ -188,6 +188,18 @@ def test_a_damaged_checkpoint_is_passed_over_and_all_damaged_is_an_error(tmp_pat
         opened.restore(state)
 
 
+# Orbax leaves what it was about to read unawaited when it finds another shape.
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
+def test_a_checkpoint_of_another_version_is_an_error_and_stays(tmp_path):
+    state = {"seconds": np.arange(8.0)}
+    with Run(tmp_path / "run", {"a": 1}) as opened:
+        opened.save(state)
+    with Run(tmp_path / "run", {"a": 1}) as opened, pytest.raises(RunError, match="go on with the version that wrote"):
+        opened.restore({"seconds": np.zeros(9)})
+    with Run(tmp_path / "run", {"a": 1}) as opened:
+        np.testing.assert_array_equal(opened.restore({"seconds": np.zeros(8)})["seconds"], state["seconds"])
+
+
 def _damage(folder: Path) -> None:
     for path in folder.rglob("*"):
         if path.is_file():

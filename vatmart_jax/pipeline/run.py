@@ -57,24 +57,26 @@ class Run:
     def restore(self, state: Any) -> Any:
         """The last checkpointed state, or `state` itself (which says shapes and types) where there is none.
 
-        Metrics logged after that checkpoint are dropped: their work is done again. A damaged checkpoint is passed
-        over for the one before; RunError where none can be read.
+        Metrics logged after that checkpoint are dropped: their work is done again. A damaged checkpoint gives way to
+        the one before; RunError where none can be read, and all are left.
         """
         steps = sorted(self._checkpoints.all_steps(), reverse=True)
         like = {"state": jax.tree.map(_plain, state), "lines": jnp.int32(0)}
-        problems = []
+        problems: dict[int, str] = {}
         for step in steps:
             try:
                 found = self._checkpoints.restore(step, args=ocp.args.StandardRestore(like))
             except (ValueError, KeyError, OSError, TypeError) as e:
-                problems.append(f"{step}: {first_line(e)[:120]}")
-                self._checkpoints.delete(step)
+                problems[step] = first_line(e)[:120]
                 continue
+            for damaged in problems:
+                self._checkpoints.delete(damaged)
             self._truncate(int(found["lines"]))
             return jax.tree.map(lambda kind, value: _as(kind, value), state, found["state"])
         if problems:
             raise RunError(
-                f"{self.folder}/checkpoints: cannot be read ({'; '.join(problems)}); delete {self.folder} to start over"
+                f"{self.folder}/checkpoints: cannot be read ({'; '.join(f'{k}: {v}' for k, v in problems.items())}); "
+                f"go on with the version that wrote them, or delete {self.folder} to start over"
             )
         self._truncate(0)
         return state
