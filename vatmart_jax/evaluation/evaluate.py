@@ -151,7 +151,7 @@ def _priors_split(
     folder: Path, env: Env, priors: Priors, settings: Settings, key: jax.Array, split: str, report: Report
 ) -> dict[str, Any]:
     explorer = Explorer(env, settings.explore)
-    policy = _policy(folder, explorer)
+    policy = load_policy(folder, explorer)
     kl, km = jax.random.split(key)
     report(f"label trajectories on {split}", 0, 1, {})
     positive, negative = labelled(explorer, policy, _LABELLED, kl)
@@ -165,8 +165,8 @@ def _priors_split(
     return result
 
 
-def _policy(folder: Path, explorer: Explorer) -> Any:
-    """The parameters of a run's policy."""
+def load_policy(folder: Path, explorer: Explorer) -> Any:
+    """The parameters of a run's policy. Raises UserError where its file cannot be read."""
     path = folder / "policy.msgpack"
     try:
         return serialization.from_bytes(explorer.init(jax.random.key(0)).td3.policy, path.read_bytes())
@@ -185,7 +185,7 @@ def _evaluate_policy(
     paper; a part that is let go is a failure. Consumes the key.
     """
     explorer = Explorer(env, settings.explore)
-    policy = _policy(folder, explorer)
+    policy = load_policy(folder, explorer)
     k_pool, k_run = jax.random.split(key)
     say = lambda done: report("policy's starts", done, trials, {})  # noqa: E731
     pool = start_pool(env, k_pool, trials, say)

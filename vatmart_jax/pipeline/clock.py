@@ -3,21 +3,25 @@
 from __future__ import annotations
 
 import time
+from functools import cache
 from typing import NamedTuple
 
 import jax.monitoring
 
 _COMPILE_EVENT = "/jax/core/compile/backend_compile_duration"  # reading a program from the compilation cache included
-_compiling = 0.0  # seconds in this process
 
 
-def _heard(event: str, duration_secs: float, **_: str | int) -> None:
-    global _compiling
-    if event == _COMPILE_EVENT:
-        _compiling += duration_secs
+@cache
+def _compilations() -> list[float]:
+    """Seconds of each of this process's compilations from the first call on; JAX tells them to listeners alone."""
+    seconds: list[float] = []
 
+    def heard(event: str, duration_secs: float, **_: str | int) -> None:
+        if event == _COMPILE_EVENT:
+            seconds.append(duration_secs)
 
-jax.monitoring.register_event_duration_secs_listener(_heard)
+    jax.monitoring.register_event_duration_secs_listener(heard)
+    return seconds
 
 
 class Lap(NamedTuple):
@@ -31,11 +35,11 @@ class Clock:
     """Runs from its making on."""
 
     def __init__(self) -> None:
-        self._begun, self._compiling = time.monotonic(), _compiling
+        self._begun, self._compiled = time.monotonic(), len(_compilations())
 
     def lap(self) -> Lap:
         """The time since the last lap."""
-        begun, compiled = self._begun, self._compiling
-        self._begun, self._compiling = time.monotonic(), _compiling
-        compiling = _compiling - compiled
-        return Lap(max(0.0, self._begun - begun - compiling), compiling)
+        now, compilations = time.monotonic(), _compilations()
+        wall, compiling = now - self._begun, sum(compilations[self._compiled :])
+        self._begun, self._compiled = now, len(compilations)
+        return Lap(max(0.0, wall - compiling), compiling)
