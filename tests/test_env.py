@@ -365,6 +365,17 @@ def test_rewards_are_the_papers(runs):
         np.testing.assert_allclose(state.reward, np.where(before.done, 0, expected), atol=0.05)
 
 
+def test_a_hand_strains_as_far_as_it_is_from_where_it_was_sent(runs):
+    run = runs("pull-drawer")
+    begun = run.begin(run.starts(slice(8), [0, 0, 1], 0.4))
+    assert (np.asarray(run.env.strain(begun)) < 0.01).all()
+    along = run.execute(begun.start, jnp.zeros((BATCH, g.WAYPOINTS, 6)))
+    across = run.execute(begun.start, jnp.zeros((BATCH, g.WAYPOINTS, 6)).at[:, 0, 2].set(0.1))
+    ok = np.asarray(along.held & across.held)
+    assert ok.any() and (np.asarray(run.env.strain(along)) < 0.01)[ok].all()
+    assert (np.asarray(run.env.strain(across)) > 0.03)[ok].all()
+
+
 def test_a_nan_action_fails_its_own_trial_and_no_other(runs):
     run = runs("push-door")
     begun = run.begin(run.starts(slice(8), [0, 0, 1], 0.4))

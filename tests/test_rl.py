@@ -195,6 +195,7 @@ def episode() -> Episode:
     return Episode(
         as_f32(obs[0]), as_f32(rng.uniform(-1, 1, (K, B, 2))), as_f32(rng.normal(size=(K, B))), as_f32(obs[1]),
         jnp.asarray(done), jnp.asarray(active), as_f32(before), as_f32(after), as_f32(distance), jnp.asarray(held),
+        as_f32(rng.uniform(0, 50, (K, B))),
     )  # fmt: skip
 
 
@@ -248,6 +249,7 @@ def test_hindsight_rewards_and_ends_are_those_of_the_new_task(episode, relabelle
         - 150 * distance
         - 300 * (distance > 0.1)
         + (500 - curiosity) * success
+        - np.asarray(episode.cost)
     )
     np.testing.assert_allclose(copies.reward[keep], expected[keep], atol=1e-3)
     last = np.arange(K)[:, None] == K - 1

@@ -449,6 +449,13 @@ class Env:
         """[B, 3] the point between the fingertips, object frame."""
         return self._tip(state.physics, state.start.rotation)
 
+    def strain(self, state: EnvState) -> jax.Array:
+        """[B] how far the hand is from where it was sent (unit lengths): the fingertips, and the turn times the hand's
+        length. The controller is a spring, so this is about the force with which the hand strains at the part."""
+        sent = state.point - self.config.standoff * state.start.rotation[:, :, 2] + state.tip
+        turn = state.euler - state.physics.qpos[:, HAND][:, 3:]
+        return jnp.linalg.norm(sent - self.tip(state), axis=-1) + TIP * jnp.linalg.norm(turn, axis=-1)
+
     def _tip(self, physics: PhysicsState, start: jax.Array) -> jax.Array:
         hand_q = physics.qpos[:, HAND]
         now = start @ g.matrix_from_euler(hand_q[:, 3:])

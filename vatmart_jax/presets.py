@@ -82,7 +82,7 @@ _ON_CPU = PerceptionConfig(
 PRESETS = {
     "quick": Settings(explore=ExploreConfig(iterations=60, pool=2048), perception=_ON_CPU),
     "cpu": Settings(
-        explore=ExploreConfig(iterations=100, pool=4096),
+        explore=ExploreConfig(iterations=100, pool=4096, strain=1000.0),
         perception=replace(
             _ON_CPU, networks=replace(_ON_CPU.networks, pointnet=replace(SMALL, context=(64, 128))), encoder_rate=0.25
         ),

@@ -33,6 +33,8 @@ class ExploreConfig:
     """share of uniformly random actions, decaying as the noise does"""
     warmup: int = 4
     """iterations before the policy acts: half of the trials take random actions, half are the scripted expert's"""
+    strain: float = 0.0
+    """pulling: penalty per unit length that the hand is from where it was sent, see `Env.strain`; the paper has none"""
     hindsight_low: float = 0.5
     """relabelled tasks reach down to this share of the smallest task"""
 
@@ -83,9 +85,10 @@ class Explorer:
             shown = jnp.clip(shown + noise * jax.random.normal(kx, shown.shape), -1, 1)
             action = jnp.where(jnp.arange(len(action))[:, None] < expert * len(action), shown, action)
             after = self.env.step(state, action, abandon)
+            cost = self.config.strain * self.env.task.opening * self.env.strain(after)
             record = Episode(
-                state.obs, action, after.reward, after.obs, after.done, ~state.done & ~after.physics.diverged,
-                state.moved, after.moved, after.info["tip_distance"], after.held,
+                state.obs, action, after.reward - cost, after.obs, after.done, ~state.done & ~after.physics.diverged,
+                state.moved, after.moved, after.info["tip_distance"], after.held, cost,
             )  # fmt: skip
             return after, record
 

@@ -70,6 +70,7 @@ class Episode:
     after: jax.Array  # [K, B] and after it
     distance: jax.Array  # [K, B] fingertips to contact, after the step
     held: jax.Array  # [K, B] bool, after the step
+    cost: jax.Array  # [K, B] taken off the reward, whatever the task
 
     def transitions(self) -> tuple[Transition, jax.Array]:
         """All K * B steps and which were made."""
@@ -99,7 +100,7 @@ def hindsight(
     keep = episode.active & episode.held & (goal >= goals[0]) & (goal <= goals[1]) & (episode.before < goal)
     success = (jnp.abs(goal - episode.after) <= tolerance * goal) & episode.held
     terms = reward(goal, episode.before, episode.after, episode.distance, success)
-    total = sum(terms.values()) - curiosity * success
+    total = sum(terms.values()) - episode.cost - curiosity * success
     relabel = lambda obs, moved: obs.at[..., 1].set(goal).at[..., 2].set(goal - moved)  # noqa: E731
     last = jnp.arange(steps)[:, None] == steps - 1
     copies = Transition(
