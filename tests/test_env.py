@@ -367,13 +367,13 @@ def test_rewards_are_the_papers(runs):
 
 def test_a_hand_strains_as_far_as_it_is_from_where_it_was_sent(runs):
     run = runs("pull-drawer")
-    begun = run.begin(run.starts(slice(8), [0, 0, 1], 0.4))
-    assert (np.asarray(run.env.strain(begun)) < 0.01).all()
-    along = run.execute(begun.start, jnp.zeros((BATCH, g.WAYPOINTS, 6)))
-    across = run.execute(begun.start, jnp.zeros((BATCH, g.WAYPOINTS, 6)).at[:, 0, 2].set(0.1))
-    ok = np.asarray(along.held & across.held)
-    assert ok.any() and (np.asarray(run.env.strain(along)) < 0.01)[ok].all()
-    assert (np.asarray(run.env.strain(across)) > 0.03)[ok].all()
+    begun = run.begin(run.starts(slice(8, 16), [0, 1, 0], 0.15))
+    stay = jnp.zeros((BATCH, g.WAYPOINTS, 6))
+    across = stay.at[:, 0, 2].set(0.1)  # the drawer gives way along its axis only
+    for residuals, low, high in ((stay, 0.0, 0.01), (across, 0.03, 0.1)):
+        state = run.execute(begun.start, residuals)
+        strain = np.asarray(run.env.strain(state))
+        assert state.held.all() and (strain >= low).all() and (strain < high).all()
 
 
 def test_a_nan_action_fails_its_own_trial_and_no_other(runs):
