@@ -82,7 +82,7 @@ _ON_CPU = PerceptionConfig(
 PRESETS = {
     "quick": Settings(explore=ExploreConfig(iterations=60, pool=2048), perception=_ON_CPU),
     "cpu": Settings(
-        explore=ExploreConfig(iterations=100, pool=4096, strain=1000.0),
+        explore=ExploreConfig(iterations=100, pool=4096),
         perception=replace(
             _ON_CPU, networks=replace(_ON_CPU.networks, pointnet=replace(SMALL, context=(64, 128))), encoder_rate=0.25
         ),
@@ -107,6 +107,7 @@ PRESETS = {
             iterations=5000,
             td3=TD3Config(batch=512, learning_rate=1e-4, saturation=0.0, capacity=2048, policy_delay=3, updates=6),
             noise=(0.1, 0.1 / 2**10),
+            strain=0.0,
         ),
         perception=PerceptionConfig(
             networks=NetworksConfig(separate=True, positions=False), views=8, queries=4, probes=4,

@@ -33,7 +33,7 @@ class ExploreConfig:
     """share of uniformly random actions, decaying as the noise does"""
     warmup: int = 4
     """iterations before the policy acts: half of the trials take random actions, half are the scripted expert's"""
-    strain: float = 0.0
+    strain: float = 1000.0
     """pulling: penalty per unit length that the hand is from where it was sent, see `Env.strain`; the paper has none"""
     hindsight_low: float = 0.5
     """relabelled tasks reach down to this share of the smallest task"""
