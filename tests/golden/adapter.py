@@ -17,22 +17,22 @@ import numpy as np
 
 from conversion.convert import ConvertConfig, convert
 from mjcf_assets.generator import generate
-from vatmart_jax.bank import SceneBank, ViewBank
-from vatmart_jax.cli import COMMANDS, main
-from vatmart_jax.data import Data
-from vatmart_jax.env import TASKS, EnvConfig
-from vatmart_jax.inference import Priors
+from vatmart_jax.data.banks import SceneBank, ViewBank
+from vatmart_jax.cli.main import COMMANDS, main
+from vatmart_jax.data.dataset import Data
+from vatmart_jax.envs.env import TASKS, EnvConfig
+from vatmart_jax.priors.priors import Priors
 from vatmart_jax.perception.networks import NetworksConfig
 from vatmart_jax.perception.pointnet2 import Around, Level, PointNetConfig
-from vatmart_jax.perception.train import PerceptionConfig
+from vatmart_jax.perception.trainer import PerceptionConfig
 from vatmart_jax.physics import PhysicsConfig
-from vatmart_jax.pipeline.explore import ExploreConfig
-from vatmart_jax.pipeline.run import Run, read_metrics
-from vatmart_jax.pipeline.train import Training
-from vatmart_jax.presets import PRESETS, EvaluationConfig, Schedule, Settings
-from vatmart_jax.pretrained import names, run_folder
+from vatmart_jax.pipeline.exploration import ExploreConfig
+from vatmart_jax.pipeline.run_dir import Run, read_metrics
+from vatmart_jax.pipeline.trainer import Training
+from vatmart_jax.pipeline.presets import PRESETS, EvaluationConfig, Schedule, Settings
+from vatmart_jax.priors.pretrained import names, run_folder
 from vatmart_jax.rl.td3 import TD3Config
-from vatmart_jax.training import resolve
+from vatmart_jax.workflows.train import resolve
 
 RENAMED: dict[str, str] = {}
 """New name -> golden name, of arrays, metrics and stages."""
