@@ -38,7 +38,7 @@ from conversion.report import contact_sheet, page, picture, read_png, save_png
 from conversion.scenes import scene_bank
 from conversion.textures import read_mtl
 from conversion.views import views
-from vatmart_jax.atomic_io import whole_folder, write_json, write_text
+from vatmart_jax.atomic_io import atomic_directory, write_json, write_text
 from vatmart_jax.data.banks import SceneBank
 
 URDF_NAMES = ("mobility.urdf", "mobility_vhacd.urdf")
@@ -149,7 +149,7 @@ def _object_folders(sources: Sequence[Path], out: Path) -> list[Path]:
     for source in sources:
         if not source.is_dir():
             raise ObjectError(f"{source}: no such folder; name PartNet-Mobility object folders or a folder of them")
-        is_object = lambda p: any((p / n).exists() for n in URDF_NAMES)  # noqa: E731
+        is_object = lambda p: any((p / n).exists() for n in URDF_NAMES)
         inside = sorted(p for p in source.iterdir() if p.is_dir() and not p.name.startswith("."))
         if is_object(source) or not any(is_object(p) for p in inside):
             folders.append(source)
@@ -250,7 +250,7 @@ def _convert_one(folder: Path, out: Path, config: ConvertConfig, split: str | No
         "merged_scenes": [asdict(s) for s in slots],
         "seconds": round(time.process_time() - start, 3),  # of one core
     }
-    with whole_folder(out / obj.id) as part:
+    with atomic_directory(out / obj.id) as part:
         mjcf.write(part)
         converted.save(part)
         bank.save(part / "scenes.npz")

@@ -235,7 +235,7 @@ def _areas(triangles: np.ndarray) -> np.ndarray:
 def _point_triangle(p: np.ndarray, triangles: np.ndarray) -> np.ndarray:
     """Distance [n] of points [n, 3], each to its own triangle [n, 3, 3] (Ericson 2004, 5.1.5)."""
     a, b, c = triangles.transpose(1, 0, 2)
-    dot = lambda x, y: np.einsum("ij,ij->i", x, y)  # noqa: E731
+    dot = lambda x, y: np.einsum("ij,ij->i", x, y)
     ab, ac, ap, bp, cp = b - a, c - a, p - a, p - b, p - c
     d1, d2, d3, d4, d5, d6 = dot(ab, ap), dot(ac, ap), dot(ab, bp), dot(ac, bp), dot(ab, cp), dot(ac, cp)
     va, vb, vc = d3 * d6 - d5 * d4, d5 * d2 - d1 * d6, d1 * d4 - d3 * d2
@@ -531,7 +531,7 @@ def _merge(pieces: list[_Piece], surface: Surface, free: float, budget: int, con
 
 def _absorb(pieces: list[_Piece], surface: Surface, target: int, config: DecomposeConfig) -> list[_Piece]:
     """Where there are far too many pieces for all pairs: the smallest joins the best of its six nearest."""
-    size = lambda p: float(np.linalg.norm(p.bounds[1] - p.bounds[0]))  # noqa: E731
+    size = lambda p: float(np.linalg.norm(p.bounds[1] - p.bounds[0]))
     pieces = sorted(pieces, key=size)
     while len(pieces) > target:
         small, rest = pieces[0], pieces[1:]

@@ -25,7 +25,7 @@ from scipy.spatial.transform import Rotation
 from trimesh.ray.ray_pyembree import RayMeshIntersector
 
 from conversion.textures import Material, Skin, read_mtl, read_png
-from vatmart_jax.atomic_io import whole
+from vatmart_jax.atomic_io import atomic_write
 from vatmart_jax.errors import UserError
 
 MAX_COORDINATE = 1e3  # objects are normalised to about 2 unit lengths; anything near this is damage
@@ -195,7 +195,7 @@ class ConvertedObject:
         faces, face_start = _pack([v.faces for _, v in visuals])
         hull_vertices, hull_start = _pack([h.vertices for _, h in hulls])
         boxes = [h for _, h in hulls if h.box_size is not None]
-        with whole(folder / "object.npz") as part, part.open("wb") as f:
+        with atomic_write(folder / "object.npz") as part, part.open("wb") as f:
             np.savez(
                 f,
                 text=np.array(json.dumps(text)),
@@ -501,13 +501,13 @@ def _visuals(reader: _Reader, urdf: str, link: yourdfpy.Link) -> Iterator[Visual
 def _primitive(reader: _Reader, urdf: str, link: str, geometry: yourdfpy.Geometry) -> tuple[np.ndarray, np.ndarray]:
     if geometry.box is not None:
         size = np.asarray(geometry.box.size, np.float64)
-        build = lambda: trimesh.creation.box(size)  # noqa: E731
+        build = lambda: trimesh.creation.box(size)
     elif geometry.cylinder is not None:
         size = np.array([geometry.cylinder.radius, geometry.cylinder.length])
-        build = lambda: trimesh.creation.cylinder(size[0], size[1], sections=24)  # noqa: E731
+        build = lambda: trimesh.creation.cylinder(size[0], size[1], sections=24)
     elif geometry.sphere is not None:
         size = np.array([geometry.sphere.radius])
-        build = lambda: trimesh.creation.icosphere(2, size[0])  # noqa: E731
+        build = lambda: trimesh.creation.icosphere(2, size[0])
     else:
         raise reader.error(f"link {link!r} has an empty geometry; give it a mesh", urdf)
     if size.shape not in ((1,), (2,), (3,)) or not ((size > 0) & (size < MAX_COORDINATE)).all():
@@ -596,7 +596,7 @@ def _read_obj(reader: _Reader, file: str, path: Path) -> _Mesh:
 def _materials(reader: _Reader, file: str, libraries: list[str], names: list[str]) -> tuple[Material | None, ...]:
     """By name, from the MTL files an OBJ file names; None, and a note, where there is none. The first has no name."""
     found = {}
-    beside = lambda f, name: os.path.normpath((Path(f).parent / name).as_posix())  # noqa: E731
+    beside = lambda f, name: os.path.normpath((Path(f).parent / name).as_posix())
     for library in libraries:
         if (text := reader.text(beside(file, library))) is None:
             reader.note(f"material library {library!r} not readable inside the folder, plain colours")
@@ -725,7 +725,7 @@ def _closed_value(obj: PartNetObject, joint: Joint) -> float:
     own = obj.groups[joint.child]
     posed = [_posed(obj, own, {joint.name: value}) for value in candidates]
     size = np.ptp(rest.reshape(-1, 3), axis=0).max()
-    depth = lambda points: (points @ equations[:, :3].T + equations[:, 3]).max(axis=1)  # noqa: E731
+    depth = lambda points: (points @ equations[:, :3].T + equations[:, 3]).max(axis=1)
     # A drawer belongs inside the hull, a door on it: it may also swing inwards.
     off = (lambda d: np.maximum(d, 0)) if joint.type == "prismatic" else np.abs
     out = np.array([off(depth(p.reshape(-1, 3))).mean() for p in posed]) / size

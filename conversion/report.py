@@ -15,7 +15,7 @@ from scipy.spatial import ConvexHull
 from trimesh.ray.ray_pyembree import RayMeshIntersector
 
 from conversion.partnet import ConvertedObject, PartNetObject
-from vatmart_jax.atomic_io import whole
+from vatmart_jax.atomic_io import atomic_write
 
 _LIGHT = np.array([-0.5, 0.35, 0.8]) / np.linalg.norm([-0.5, 0.35, 0.8])
 _PALETTE = np.array(
@@ -52,7 +52,7 @@ def contact_sheet(pictures: Sequence[np.ndarray], columns: int) -> np.ndarray:
 
 def save_png(path: Path, image: np.ndarray) -> None:
     """Complete or not at all."""
-    with whole(path) as part:
+    with atomic_write(path) as part:
         image_file.imsave(part, image, format="png")
 
 

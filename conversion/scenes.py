@@ -66,7 +66,7 @@ def scene_bank(objects: Sequence[ConvertedObject], variants: int, collision: str
                 "urdf_sign": part.sign,
             })  # fmt: skip
     table = [row for rows in (*static, *moving) for row in rows]
-    column = lambda name, dtype, *shape: np.array([s[name] for s in scenes], dtype).reshape(-1, *shape)  # noqa: E731
+    column = lambda name, dtype, *shape: np.array([s[name] for s in scenes], dtype).reshape(-1, *shape)
     vertices = [h.vertices for h in shapes] if collision == "hull" else []
     sizes = [h.box_size for h in shapes] if collision == "box" else []
     bank = SceneBank(

@@ -221,7 +221,7 @@ def _draw(
 
 def _stack(rows: list[tuple], n_points: int, n_contacts: int) -> ViewBank:
     columns = list(zip(*rows, strict=True)) or [()] * 11
-    array = lambda k, dtype, *shape: np.array(columns[k], dtype).reshape(-1, *shape)  # noqa: E731
+    array = lambda k, dtype, *shape: np.array(columns[k], dtype).reshape(-1, *shape)
     return ViewBank(
         scene=array(0, np.int32),
         q=array(1, np.float32),

@@ -65,7 +65,7 @@ def share(values, bound: float) -> float:
     return round(float((values <= bound).mean()), 4) if len(values) else 1.0
 
 
-def spread(values) -> dict[str, float]:
+def tta_transforms(values) -> dict[str, float]:
     values = np.asarray(values, float)
     if not len(values):
         return {}
@@ -170,9 +170,9 @@ def _gaps_and_phantoms(moving: list[Group], rest: list[Group], phantoms: int = 5
         gap, phantom = [g["gap_max"] for *_, g in rows], [g["phantom_share"] for *_, g in rows]
         out[name] = {
             "groups": len(rows),
-            "gap": spread(gap),
+            "gap": tta_transforms(gap),
             "gap_within_0.005": share(gap, 0.005),
-            "phantom_share": spread(phantom),
+            "phantom_share": tta_transforms(phantom),
             f"phantom_within_{bound}": share(phantom, bound),
             "worst_gap": _worst(rows, "gap_max"),
             "worst_phantom": _worst(rows, "phantom_share", phantoms),
@@ -210,7 +210,7 @@ def _by_sight(visuals: list[Visual], hulls: list[np.ndarray], rng: np.random.Gen
     seen = np.concatenate([seen, mesh.vertices[:: max(1, len(mesh.vertices) // 1000)]])
     seen = seen[_visible(mesh, seen, rng)]
     planes = [ConvexHull(h).equations for h in hulls]
-    depth = lambda p: np.min([(p @ e[:, :3].T + e[:, 3]).max(axis=1) for e in planes], axis=0)  # noqa: E731
+    depth = lambda p: np.min([(p @ e[:, :3].T + e[:, 3]).max(axis=1) for e in planes], axis=0)
     out = seen[depth(seen) > 1e-4]
     gap = trimesh.proximity.closest_point(skin, out)[1] if len(out) else np.zeros(1)
     on = trimesh.sample.sample_surface(skin, 3000, seed=seed)[0]
@@ -245,14 +245,14 @@ def budget(check: Check) -> dict[str, Any]:
         "scenes": len(bank),
         "shapes": len(vertices) if bank.collision == "hull" else len(bank.box_size),
         "within_16_and_32": round(float(within.mean()), 4),
-        "static": spread(static),
-        "part": spread(part),
+        "static": tta_transforms(static),
+        "part": tta_transforms(part),
         "vertices_max": int(vertices.max(initial=0)),
         "over": over,
         "sides_merged": len(merged),
         "objects_that_merged": len(said),
-        "merged_gap": spread([m["gap_max"] for m in merged]),
-        "merged_phantom_share": spread([m["phantom_share"] for m in merged]),
+        "merged_gap": tta_transforms([m["gap_max"] for m in merged]),
+        "merged_phantom_share": tta_transforms([m["phantom_share"] for m in merged]),
         "merged_phantom_within_0.05": share([m["phantom_share"] for m in merged], 0.05),
     }
 
@@ -282,7 +282,7 @@ def speed(check: Check, subset: int = 12) -> dict[str, Any]:
         control[jobs].append(_control(jobs))
     one, two = sum(wall[1]) / 2, sum(wall[2]) / 2
     return {
-        "seconds": spread(values),
+        "seconds": tta_transforms(values),
         "within_15": share(values, 15),
         "slowest": {k: seconds[k] for k in slow},
         "two_against_one": {
@@ -356,7 +356,7 @@ def rendering(check: Check, scenes: int = 48, per_scene: int = 2, points: int = 
     from conversion.scenes import scene_bank
 
     links = scene_bank(list(loaded.values()), config["variants"], config["collision"], config["seed"])
-    key = lambda b, s: (str(b.object_id[s]), str(b.part[s]), int(b.variant[s]))  # noqa: E731
+    key = lambda b, s: (str(b.object_id[s]), str(b.part[s]), int(b.variant[s]))
     wanted = {key(some, s) for s in range(len(some))}
     links = links.select(np.array([s for s in range(len(links)) if key(links, s) in wanted], int))
     start = time.monotonic()

@@ -32,7 +32,7 @@ def measure(folder: Path) -> tuple[Measured, list[np.ndarray]]:
     """What the figure shows, of all objects of the paper's categories with a door or drawer; their occupied cells."""
     out: Measured = {}
     cells = []
-    add = lambda key, value: out.setdefault(key, []).append(float(value))  # noqa: E731
+    add = lambda key, value: out.setdefault(key, []).append(float(value))
     for path in sorted(p for p in folder.iterdir() if (p / "mobility.urdf").is_file()):
         try:
             obj = read_object(path)

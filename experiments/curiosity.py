@@ -17,12 +17,12 @@ import tyro
 
 from vatmart_jax.atomic_io import write_json
 from vatmart_jax.data.dataset import Data
-from vatmart_jax.errors import UserError, at_least_one, one_of
+from vatmart_jax.errors import UserError, require_one_of, require_positive
 from vatmart_jax.evaluation.metrics import wilson_interval
 from vatmart_jax.physics.types import default_impl
 from vatmart_jax.pipeline.presets import PRESETS
 from vatmart_jax.pipeline.run_dir import read_config, read_metrics
-from vatmart_jax.reporting import Bars
+from vatmart_jax.reporting import ConsoleReporter
 from vatmart_jax.workflows.train import resolve, train
 
 
@@ -40,7 +40,7 @@ class Curiosity:
     seeds: tuple[int, ...] = (0, 1, 2)
 
 
-def run(args: Curiosity, seed: int, weight: float, out: Path, bars: Bars) -> dict[str, Any]:
+def run(args: Curiosity, seed: int, weight: float, out: Path, bars: ConsoleReporter) -> dict[str, Any]:
     """What a run's result.json says, after the run where there is none yet."""
     settings = PRESETS[args.preset]
     settings = replace(settings, schedule=replace(settings.schedule, curiosity_weight=weight))
@@ -53,13 +53,13 @@ def run(args: Curiosity, seed: int, weight: float, out: Path, bars: Bars) -> dic
 
 
 def main(args: Curiosity) -> None:
-    one_of("--preset", args.preset, PRESETS)
-    at_least_one("--seeds: their number", len(args.seeds))
+    require_one_of("--preset", args.preset, PRESETS)
+    require_positive("--seeds: their number", len(args.seeds))
     weight = PRESETS[args.preset].schedule.curiosity_weight
     names = {f"{seed}-{'on' if on else 'off'}": (seed, on) for seed in args.seeds for on in (True, False)}
     names[f"{args.seeds[0]}-on-again"] = (args.seeds[0], True)
     rows = []
-    with Bars() as bars:
+    with ConsoleReporter() as bars:
         for name, (seed, on) in names.items():
             result = run(args, seed, weight if on else 0.0, args.runs / name, bars)
             ours = {row["split"]: row for row in result["results"] if row["method"] == "ours"}

@@ -14,7 +14,7 @@ import tyro
 
 from vatmart_jax.data.banks import SceneBank, ViewBank
 from vatmart_jax.envs.env import ACTION, TASKS, Env, EnvConfig
-from vatmart_jax.envs.scripted_policy import expert_action
+from vatmart_jax.envs.scripted_policy import scripted_action
 from vatmart_jax.trajectory import WAYPOINTS
 
 
@@ -32,10 +32,10 @@ class Example:
 
 def main(args: Example) -> None:
     bank, views = SceneBank.load(args.data / "scenes.npz"), ViewBank.load(args.data / "views.npz")
-    env = Env(bank, views, TASKS[args.task], args.impl, EnvConfig(batch=args.batch))
+    env = Env(bank, views, TASKS[args.task], args.impl, EnvConfig(num_envs=args.batch))
     policies = {
         "random": lambda state, key: jax.random.uniform(key, (args.batch, ACTION), minval=-1, maxval=1),
-        "expert": lambda state, key: expert_action(env, state),
+        "expert": lambda state, key: scripted_action(env, state),
     }
     print(f"{args.task}, {args.impl}: {len(env.bank)} Scenes, {len(env.views)} views, {args.batch} trials")
     for name, policy in policies.items():

@@ -15,7 +15,7 @@ import tyro
 from vatmart_jax.atomic_io import write_json
 from vatmart_jax.data.dataset import Data
 from vatmart_jax.envs.env import TASKS, Env, EnvConfig
-from vatmart_jax.envs.scripted_policy import expert_action, expert_start
+from vatmart_jax.envs.scripted_policy import scripted_action, scripted_start
 from vatmart_jax.evaluation.metrics import wilson_interval
 from vatmart_jax.physics import PhysicsConfig
 from vatmart_jax.physics.scene_model import FINGER_OPEN, FINGERS
@@ -52,25 +52,26 @@ def study(env: Env, trials: int, seed: int) -> dict[str, Any]:
     @jax.jit
     def run(key):
         k_start, k_expert = jax.random.split(key)
-        begun = env.begin(expert_start(env, env.sample(k_start, env.config.batch), k_expert))
-        step = lambda state, _: (env.step(state, expert_action(env, state), False),) * 2  # noqa: E731
+        begun = env.begin_trials(scripted_start(env, env.sample(k_start, env.config.num_envs), k_expert))
+        step = lambda state, _: (env.step(state, scripted_action(env, state), False),) * 2
         final, path = jax.lax.scan(step, begun, length=WAYPOINTS)
         return {
             "scene": final.physics.scene,
             "view": final.start.view,
             "contact": final.start.contact,
-            "task": final.start.task,
-            "moved": final.moved,
+            "task": final.start.goal,
+            "moved": final.displacement,
             "success": final.success,
             "in_collision": final.in_collision,
             "grasped": begun.valid,
             "grip": begun.physics.qpos[:, FINGERS].sum(-1),
-            "lost": begun.valid & ~final.held,
-            "lost_first": begun.valid & ~path.held[0],
+            "lost": begun.valid & ~final.grasp_held,
+            "lost_first": begun.valid & ~path.grasp_held[0],
         }
 
     batches = [
-        jax.device_get(run(jax.random.fold_in(jax.random.key(seed), i))) for i in range(-(-trials // env.config.batch))
+        jax.device_get(run(jax.random.fold_in(jax.random.key(seed), i)))
+        for i in range(-(-trials // env.config.num_envs))
     ]
     rows = {name: np.concatenate([b[name] for b in batches])[:trials] for name in batches[0]}
     ratio = rows["moved"] / rows["task"]

@@ -16,7 +16,7 @@ import numpy as np
 import tyro
 from PIL import Image
 
-from vatmart_jax.atomic_io import whole
+from vatmart_jax.atomic_io import atomic_write
 from vatmart_jax.data.banks import SceneBank, ViewBank
 from vatmart_jax.envs.env import TASKS, Env
 from vatmart_jax.priors.pretrained import run_folder
@@ -55,7 +55,7 @@ def main(args: Figure) -> None:
         recording, result = play(args.data, scene, amount=float(amount), run=run_folder(Path(run)), seed=args.seed)
         chosen = np.array([find_scene(bank, scene)])
         env = Env(bank.select(chosen), views.of_scenes(chosen), TASKS[priors.config.task])
-        view, task = int(recording.state.start.view[0]), float(recording.state.start.task[0])
+        view, task = int(recording.state.start.view[0]), float(recording.state.start.goal[0])
         points, mask = env.views.points[view].astype(np.float32), env.views.part_mask[view]
         found = priors.predict(points, task, mask, jax.random.key(args.seed))
         asked = f"{np.degrees(task):.0f} degrees" if priors.config.task.endswith("door") else f"{task:.2f}"
@@ -76,7 +76,7 @@ def main(args: Figure) -> None:
         row[-1].set_title(f"moved {moved:.3g}", fontsize=8)
         print(text, result)
     figure.tight_layout(pad=0.2)
-    with whole(args.out) as part:
+    with atomic_write(args.out) as part:
         figure.savefig(part, dpi=75, format="png")
 
 

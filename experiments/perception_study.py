@@ -2,7 +2,7 @@
 
 vatmart train --task push-door --data DATA --out RUN
 python experiments/perception_study.py --run RUN --data DATA --out STUDY \
-    --variants "as it is:" "scaled:perception.scale=0.2,schedule.finetune=8"
+    --variants "as it is:" "scaled:perception.scale=0.2,schedule.finetune_rounds=8"
 
 A variant is a label and fields of the run's settings. Each is a run of its own in STUDY/label, which begins with the
 trials and the policy of RUN and goes on where it was killed; STUDY/study.json compares them.
@@ -20,16 +20,16 @@ import jax.numpy as jnp
 import tyro
 
 from vatmart_jax.atomic_io import write_json
-from vatmart_jax.config import from_json, to_json
+from vatmart_jax.config import to_json
 from vatmart_jax.data.dataset import Data
 from vatmart_jax.envs.env import TASKS
 from vatmart_jax.errors import UserError
 from vatmart_jax.physics.types import default_impl
-from vatmart_jax.pipeline.presets import Settings
-from vatmart_jax.pipeline.run_dir import Run, read_config
-from vatmart_jax.pipeline.trainer import STAGES, Training, run_seconds
+from vatmart_jax.pipeline.run_config import settings_of
+from vatmart_jax.pipeline.run_dir import RunDir, read_config
+from vatmart_jax.pipeline.trainer import STAGES, PipelineTrainer, run_seconds
 from vatmart_jax.priors.priors import Priors
-from vatmart_jax.reporting import Bars
+from vatmart_jax.reporting import ConsoleReporter
 from vatmart_jax.workflows.evaluate import evaluate_split
 from vatmart_jax.workflows.train import environments, priors_config
 
@@ -65,15 +65,15 @@ def changed(settings: Any, field: str, text: str) -> Any:
 
 def main(args: Study) -> None:
     described = read_config(args.run)
-    settings = from_json(Settings, described["settings"])
+    settings = settings_of(described)
     task = TASKS[described["task"]]
     data = Data(args.data, *map(Path, described["more_data"]))  # the run's trials name its views by number
     envs = environments(data, task, default_impl(), settings)
     results = []
-    with Bars() as bars:
-        with Run(args.run, described) as run:
-            training = Training(run, envs["train"], settings, described["seed"], bars)
-            done = run.restore(training.beginning())
+    with ConsoleReporter() as bars:
+        with RunDir(args.run, described) as run:
+            training = PipelineTrainer(run, envs["train"], settings, described["seed"], bars)
+            done = run.restore(training.init_state())
         for variant in args.variants:
             label, _, changes = variant.partition(":")
             own = settings
@@ -81,18 +81,20 @@ def main(args: Study) -> None:
                 field, _, text = change.partition("=")
                 own = changed(own, field, text)
             config = {**described, "settings": to_json(own), "trials_of": str(args.run)}
-            with Run(args.out / label, config) as run:
-                training = Training(run, envs["train"], own, described["seed"], bars)
-                begun = training.beginning().replace(
+            with RunDir(args.out / label, config) as run:
+                training = PipelineTrainer(run, envs["train"], own, described["seed"], bars)
+                begun = training.init_state().replace(
                     explore=done.explore, samples=done.samples, stored=done.stored,
-                    stage=jnp.int32(STAGES.index("course")),
+                    stage=jnp.int32(STAGES.index("flow")),
                 )  # fmt: skip
                 progress = training.train(begun)
             priors = Priors(priors_config(own, task), progress.perception.params)
             rows = []
             for number, (split, env) in enumerate(envs.items()):
                 key = jax.random.fold_in(jax.random.key(args.seed), number)
-                rows += evaluate_split(split, env, priors, ("ours",), args.trials, own.evaluation.proposals, key, bars)
+                rows += evaluate_split(
+                    split, env, priors, ("ours",), args.trials, own.evaluation.num_proposals, key, bars
+                )
             results.append({"variant": variant, "seconds": run_seconds(progress), "downstream": rows})
             write_json(args.out / "study.json", {"task": task.name, "seed": args.seed, "variants": results})
 

@@ -22,8 +22,8 @@ import tyro
 from vatmart_jax.atomic_io import write_json
 from vatmart_jax.bench.benchmarks import Choice, device, random_trials
 from vatmart_jax.data.banks import SceneBank, ViewBank
-from vatmart_jax.envs.env import TASKS, Env, EnvConfig, EnvState, Start
-from vatmart_jax.envs.scripted_policy import run_expert
+from vatmart_jax.envs.env import TASKS, Env, EnvConfig, EnvState, TrialStart
+from vatmart_jax.envs.scripted_policy import run_scripted_policy
 from vatmart_jax.physics import PhysicsConfig
 from vatmart_jax.physics.controller import waypoint_controls
 from vatmart_jax.physics.scene_model import HAND, N_CTRL, PART, scene_model
@@ -44,12 +44,12 @@ class Study:
     out: Path = Path(__file__).parent / "results" / "physics-convergence.json"
 
 
-def time_step(env: Env, finer: Env, start: Start, residuals: jax.Array) -> dict[str, float]:
+def time_step(env: Env, finer: Env, start: TrialStart, residuals: jax.Array) -> dict[str, float]:
     """The same trials at half the time step: where the part ends, and the label."""
     a, b = (jax.jit(e.execute)(start, residuals) for e in (env, finer))
-    apart = np.abs(np.asarray(a.moved - b.moved))
+    apart = np.abs(np.asarray(a.displacement - b.displacement))
     return {
-        "moved": round(float(np.mean(np.abs(a.moved) > 0.01)), 3),
+        "moved": round(float(np.mean(np.abs(a.displacement) > 0.01)), 3),
         "median": float(np.median(apart)),
         "p90": float(np.percentile(apart, 90)),
         "above_0.02": round(float(np.mean(apart > 0.02)), 4),
@@ -59,7 +59,7 @@ def time_step(env: Env, finer: Env, start: Start, residuals: jax.Array) -> dict[
 
 def uniform_residuals(env: Env, n: int, key: jax.Array) -> jax.Array:
     """[n, 4, 6] anything the action space allows, each axis on its own."""
-    limits = jnp.array([env.config.move_range] * 3 + [env.config.turn_range] * 3)
+    limits = jnp.array([env.config.max_translation] * 3 + [env.config.max_rotation] * 3)
     return jax.random.uniform(key, (n, WAYPOINTS, 6), minval=-1.0) * limits
 
 
@@ -67,7 +67,7 @@ def tracking(env: Env, n: int, key: jax.Array) -> dict[str, float]:
     """How far the hand, in free air, is from its target at the end of a waypoint."""
     physics, config = env.physics, env.config
     nowhere = jnp.tile(jnp.array([-5.0, 0, 0, 1, 0, 0, 0]), (n, 1))
-    reach = jnp.array([config.move_range] * 3 + [config.turn_range] * 3 + [0.0] * 2)
+    reach = jnp.array([config.max_translation] * 3 + [config.max_rotation] * 3 + [0.0] * 2)
     target = jax.random.uniform(key, (n, N_CTRL), minval=-1.0) * reach
     state = jax.jit(physics.reset)(jnp.zeros(n, jnp.int32), nowhere, jnp.zeros((n, N_CTRL + 1)))
     path = waypoint_controls(jnp.zeros((n, N_CTRL)), target, physics.config)
@@ -100,7 +100,7 @@ def coasting(env: Env, final: EnvState) -> dict[str, float]:
     }
 
 
-def pressing(env: Env, start: Start, trials: int) -> dict[str, float]:
+def pressing(env: Env, start: TrialStart, trials: int) -> dict[str, float]:
     """The hand presses straight on, 1 unit past the contact: how deep it gets into anything, and the joint past its
     limit. From the contacts that plain MuJoCo finds at the end."""
     residuals = jnp.zeros((len(start.view), WAYPOINTS, 6)).at[:, :, :3].set(0.25 * start.rotation[:, None, :, 2])
@@ -128,13 +128,13 @@ def pressing(env: Env, start: Start, trials: int) -> dict[str, float]:
     }
 
 
-def slip(env: Env, start: Start, key: jax.Array) -> dict[str, float]:
+def slip(env: Env, start: TrialStart, key: jax.Array) -> dict[str, float]:
     """How far the fingertips move along the part from the grasp to the end of the scripted expert's pull, of the
     trials that hold."""
-    final = run_expert(env, start, key)
-    begun = jax.jit(env.begin)(final.start)
-    expected = env.carried(begun, env.tip(begun), final.moved - begun.moved)
-    held = np.asarray(final.held & final.valid)
+    final = run_scripted_policy(env, start, key)
+    begun = jax.jit(env.begin_trials)(final.start)
+    expected = env.apply_joint_motion(begun, env.tip(begun), final.displacement - begun.displacement)
+    held = np.asarray(final.grasp_held & final.valid)
     along = 1e3 * np.linalg.norm(np.asarray(env.tip(final) - expected), axis=-1)[held]
     return {
         "held": round(float(held.mean()), 3),
@@ -147,7 +147,7 @@ def slip(env: Env, start: Start, key: jax.Array) -> dict[str, float]:
 def study(args: Study, name: str, bank: SceneBank, views: ViewBank) -> dict[str, Any]:
     config = PhysicsConfig()
     halved = replace(config, timestep=config.timestep / 2, steps_per_waypoint=2 * config.steps_per_waypoint)
-    make = lambda physics: Env(bank, views, TASKS[name], "c", EnvConfig(batch=args.trials), physics)  # noqa: E731
+    make = lambda physics: Env(bank, views, TASKS[name], "c", EnvConfig(num_envs=args.trials), physics)
     env, finer = make(config), make(halved)
     k_start, k_noise, k_any, k_track = jax.random.split(jax.random.key(args.seed), 4)
     start = start_pool(env, k_start, args.trials)

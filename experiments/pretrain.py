@@ -11,7 +11,7 @@ from pathlib import Path
 import tyro
 
 from vatmart_jax import pretrained
-from vatmart_jax.atomic_io import whole_folder, write_json
+from vatmart_jax.atomic_io import atomic_directory, write_json
 from vatmart_jax.pipeline.run_dir import read_config, read_metrics
 from vatmart_jax.priors.priors import Priors
 
@@ -30,7 +30,7 @@ class Pretrain:
 def main(args: Pretrain) -> None:
     config = {**read_config(args.run), "data": None, "more_data": []}  # where the objects lay is nobody's business
     priors = Priors.load(args.run)
-    with whole_folder(pretrained.FOLDER / args.name) as folder:
+    with atomic_directory(pretrained.FOLDER / args.name) as folder:
         write_json(folder / "config.json", config)
         priors.save(folder / "priors")
         shutil.copyfile(args.run / "policy.msgpack", folder / "policy.msgpack")

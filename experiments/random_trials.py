@@ -45,7 +45,7 @@ def main(args: RandomTrials) -> None:
     batches = -(-args.trials // (len(TASKS) * args.batch))
     escaped = 0
     for number, task in enumerate(TASKS.values()):
-        env = Env(bank, views, task, args.impl, EnvConfig(batch=args.batch))
+        env = Env(bank, views, task, args.impl, EnvConfig(num_envs=args.batch))
         counts = result["tasks"].setdefault(
             task.name, {"objects": len(np.unique(env.bank.object_id)), "scenes": len(env.bank), "batches": 0}
         )
@@ -71,7 +71,7 @@ def _trials(env: Env, key: jax.Array) -> dict[str, jax.Array]:
 
     def step(state, key):
         action = jax.random.uniform(key, (len(state.done), ACTION), minval=-1, maxval=1)
-        state = env.step(state, action, abandon=False)
+        state = env.step(state, action, terminate_on_failure=False)
         return state, _not_finite(state)
 
     final, bad = jax.lax.scan(step, begun, jax.random.split(k_policy, WAYPOINTS))
@@ -79,8 +79,8 @@ def _trials(env: Env, key: jax.Array) -> dict[str, jax.Array]:
     return {
         "trials": jnp.int32(len(final.done)),
         "in_collision": final.in_collision.sum(),
-        "no_grasp": (~begun.in_collision & ~begun.held).sum(),
-        "lost_grip": (begun.valid & ~final.held & ~diverged).sum(),
+        "no_grasp": (~begun.in_collision & ~begun.grasp_held).sum(),
+        "lost_grip": (begun.valid & ~final.grasp_held & ~diverged).sum(),
         "diverged": diverged.sum(),
         "success": final.success.sum(),
         "not_finite": (_not_finite(begun) | bad.any(0)).sum(),
@@ -89,7 +89,7 @@ def _trials(env: Env, key: jax.Array) -> dict[str, jax.Array]:
 
 def _not_finite(state) -> jax.Array:
     """[B] bool: something that a policy, a network or a reader of results gets to see is not a number."""
-    rows = (state.obs, state.reward, state.moved, state.trajectory, state.physics.qpos, state.physics.qvel)
+    rows = (state.obs, state.reward, state.displacement, state.trajectory, state.physics.qpos, state.physics.qvel)
     return jnp.stack([~jnp.isfinite(x.reshape(len(x), -1)).all(1) for x in rows]).any(0)
 
 

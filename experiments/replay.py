@@ -14,12 +14,11 @@ import jax.numpy as jnp
 import tyro
 
 from vatmart_jax.atomic_io import write_json
-from vatmart_jax.config import from_json
 from vatmart_jax.data.dataset import Data
-from vatmart_jax.envs.env import TASKS, Env, Start
-from vatmart_jax.pipeline.exploration import Explorer
-from vatmart_jax.pipeline.presets import Settings
-from vatmart_jax.pipeline.proposal_rollouts import samples_of
+from vatmart_jax.envs.env import TASKS, Env, TrialStart
+from vatmart_jax.pipeline.exploration import ExplorationLoop
+from vatmart_jax.pipeline.proposal_rollouts import interactions_of
+from vatmart_jax.pipeline.run_config import settings_of
 from vatmart_jax.pipeline.run_dir import read_config
 from vatmart_jax.priors.pretrained import run_folder
 from vatmart_jax.trajectory import unpack_trajectory
@@ -27,7 +26,7 @@ from vatmart_jax.workflows.evaluate import load_policy
 
 
 @dataclass(frozen=True)
-class Replay:
+class ReplayBuffer:
     """The policy's trials stop at success; what of them succeeds when only the trajectory is known?"""
 
     priors: Path
@@ -45,33 +44,33 @@ class Replay:
     seed: int = 0
 
 
-def main(args: Replay) -> None:
+def main(args: ReplayBuffer) -> None:
     folder = run_folder(args.priors)
     config = read_config(folder)
-    settings, task = from_json(Settings, config["settings"]), TASKS[config["task"]]
+    settings, task = settings_of(config), TASKS[config["task"]]
     found = {}
     for split in args.splits:
         env = Data(args.data).env(split, task, "c", settings.env, settings.physics)
-        explorer = Explorer(env, settings.explore)
+        explorer = ExplorationLoop(env, settings.explore)
         found[split] = study(args, env, explorer, load_policy(folder, explorer))
         print(split, found[split], file=sys.stderr, flush=True)
         write_json(args.out, {"priors": str(args.priors), "seed": args.seed, "splits": found})
 
 
-def study(args: Replay, env: Env, explorer: Explorer, policy: Any) -> dict[str, Any]:
+def study(args: ReplayBuffer, env: Env, explorer: ExplorationLoop, policy: Any) -> dict[str, Any]:
     """How many of the policy's successes there were, and the shares that succeed again, by what was changed."""
     tolerance, contacts = env.config.tolerance, jnp.asarray(env.views.contacts)
 
     @jax.jit
-    def again(start: Start, trajectory: jax.Array) -> jax.Array:
+    def again(start: TrialStart, trajectory: jax.Array) -> jax.Array:
         rotation, residuals = unpack_trajectory(trajectory)
-        return samples_of(env.execute(start.replace(rotation=rotation), residuals), trajectory).success(tolerance)
+        return interactions_of(env.execute(start.replace(rotation=rotation), residuals), trajectory).success(tolerance)
 
     successes, wins, distances = 0, Counter[str](), []
     for batch in range(args.batches):
         k_run, k_noise = jax.random.split(jax.random.fold_in(jax.random.key(args.seed), batch))
-        final, _ = explorer.run(policy, None, k_run, 0.05, 0.0, abandon=False)
-        start, made = final.start, samples_of(final)
+        final, _ = explorer.rollout(policy, None, k_run, 0.05, 0.0, terminate_on_failure=False)
+        start, made = final.start, interactions_of(final)
         won, trajectory = made.success(tolerance), made.trajectory
         successes += int(won.sum())
         wins["as they are"] += int((won & again(start, trajectory)).sum())
@@ -92,4 +91,4 @@ def study(args: Replay, env: Env, explorer: Explorer, policy: Any) -> dict[str, 
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Replay))
+    main(tyro.cli(ReplayBuffer))

@@ -110,7 +110,7 @@ def pick(rng: np.random.Generator, weights: dict[str, float]) -> str:
 def handle(rng: np.random.Generator, s: Style, at: np.ndarray, span: float, vertical: bool) -> list[Mesh]:
     """The meshes of a handle centred at `at` [3] on a front that faces +z, along y if vertical, else along x."""
     d, t, half = s.reach, s.thick, span / 2
-    bend = lambda along, out: np.array([0.0, along, out] if vertical else [along, 0.0, out])  # noqa: E731
+    bend = lambda along, out: np.array([0.0, along, out] if vertical else [along, 0.0, out])
 
     def bar(lo: float, hi: float, z0: float, z1: float, width: float) -> Mesh:
         across = np.array([width / 2, 0, 0] if vertical else [0, width / 2, 0])
@@ -161,7 +161,7 @@ def face(rng: np.random.Generator, style: str, r: Rect, z0: float, z1: float) ->
     if style == "louvre":
         n = int(np.clip(hole.height / 0.07, 3, 12))
         y = np.linspace(hole.y0, hole.y1, n + 1)
-        slat = lambda a, b: np.array([[a, z0 + 0.1 * t], [a + 0.2 * (b - a), z1], [b, z0 + 0.4 * t]])  # noqa: E731
+        slat = lambda a, b: np.array([[a, z0 + 0.1 * t], [a + 0.2 * (b - a), z1], [b, z0 + 0.4 * t]])
         return {"board": rails + [prism(slat(a, b), 0, hole.x0, hole.x1) for a, b in pairwise(y)]}
     return {"board": [*rails, board(hole, z0, z0 + 0.55 * t)]}
 
@@ -236,7 +236,7 @@ def porthole(rng: np.random.Generator, s: Style, body: Link, cell: Rect, z: floa
     # An inset leaf's far edge swings out past the hole's.
     slit = max(s.gap, 0.6 * s.front**2 / half)
     hole, front = (r.shrink(-slit), z1) if s.inset else (r.shrink(0.7 * rim), z0)
-    ring = lambda q: rounded(q, radius * min(q.width, q.height) / (2 * half), start=0)  # noqa: E731
+    ring = lambda q: rounded(q, radius * min(q.width, q.height) / (2 * half), start=0)
     body.add("frame", plate(cell, ring(hole), 2, front - s.board, front))
 
     # The floor of a dish must pass the hole as well, turning about the leaf's front edge on the hinge's side.

@@ -44,7 +44,7 @@ from mjcf_assets.solids import (
     sweep,
     tub,
 )  # fmt: skip
-from vatmart_jax.atomic_io import whole_folder, write_text
+from vatmart_jax.atomic_io import atomic_directory, write_text
 from vatmart_jax.errors import UserError
 
 # The order in which categories come: each of them early, and in proportions like those of the real set.
@@ -129,7 +129,7 @@ def fill(
 
 def column(rng: np.random.Generator, width: float, height: float, drawers: float) -> list[tuple[str, float]]:
     """What is stacked in one column, from above: (kind, height). drawers: how likely drawers are."""
-    leaf = lambda: "pair" if width > 0.8 or (width > 0.6 and rng.random() < 0.5) else "door"  # noqa: E731
+    leaf = lambda: "pair" if width > 0.8 or (width > 0.6 and rng.random() < 0.5) else "door"
     if rng.random() < drawers * 0.55:
         n = int(np.clip(rng.integers(1, 5), np.ceil(height / 0.5), max(height / 0.14, 1)))
         share = np.linspace(1, rng.choice([1.0, 1.0, 1.8]), n)
@@ -464,7 +464,7 @@ def microwave(rng: np.random.Generator) -> list[Link]:
         links.append(tray)
     # Controls, from one end of the panel: a display, then knobs or a field of buttons.
     long, short = (panel.width, panel.height) if drop else (panel.height, panel.width)
-    across = lambda a, b: (panel.x0 + a, panel.centre[1] + b) if drop else (panel.centre[0] + b, panel.y1 - a)  # noqa: E731
+    across = lambda a, b: (panel.x0 + a, panel.centre[1] + b) if drop else (panel.centre[0] + b, panel.y1 - a)
     x, y = across(0.14 * long, 0)
     size = (0.08 * long, 0.25 * short) if drop else (0.3 * short, 0.05 * long)
     body.add("display_panel", board(Rect(x - size[0], y - size[1], x + size[0], y + size[1]), face_z, face_z + 0.004))
@@ -517,7 +517,7 @@ def safe(rng: np.random.Generator) -> list[Link]:
         z += relief(s.front)
     sign = 1.0 if side == "left" else -1.0
     c = front.centre
-    spot = lambda x, y: np.array([c[0] + sign * x * front.width, c[1] + y * front.height, z])  # noqa: E731
+    spot = lambda x, y: np.array([c[0] + sign * x * front.width, c[1] + y * front.height, z])
     links = [link]
     lock = pick(rng, {"dial and lever": 2, "wheel and dial": 2, "keypad and lever": 2, "keypad": 1, "wheel": 1})
     small = min(front.width, front.height)
@@ -719,7 +719,7 @@ def _write(folder: Path, category: str, links: list[Link], rng: np.random.Genera
         np.zeros(3) if link.joint is None or not link.joint.origin.any() else scale * (link.joint.origin - centre)
         for link in links
     ]
-    with whole_folder(folder) as part:
+    with atomic_directory(folder) as part:
         (part / "textured_objs").mkdir()
         urdf, semantics, mobility = [], [], []
         objs = parts = 0

@@ -48,7 +48,7 @@ def loft(rings: list[np.ndarray], closed: bool = False) -> Mesh:
     k, n = len(rings[0]), len(rings)
     a = (np.arange(n if closed else n - 1)[:, None] * k + np.arange(k)).ravel()
     b = a // k * k + (a + 1) % k
-    up = lambda i: (i + k) % (n * k)  # noqa: E731
+    up = lambda i: (i + k) % (n * k)
     faces = [np.stack([a, b, up(b)], 1), np.stack([a, up(b), up(a)], 1)]
     if not closed:
         fan = np.stack([np.zeros(k - 2, int), np.arange(2, k), np.arange(1, k - 1)], 1)

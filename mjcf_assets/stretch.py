@@ -15,7 +15,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from mjcf_assets.generator import GeneratorError, make_folder
-from vatmart_jax.atomic_io import whole_folder, write_text
+from vatmart_jax.atomic_io import atomic_directory, write_text
 
 LIMIT = 0.35  # of the logarithm of a length's factor
 _ASKEW = 0.02  # sine of the angle by which a frame may be off its parent's axes
@@ -51,7 +51,7 @@ def stretched_copies(source: Path, out: Path, count: int, seed: int) -> list[str
             if robot is None:
                 break
             name = f"{original}x{k}"
-            with whole_folder(out / name) as part:
+            with atomic_directory(out / name) as part:
                 shutil.copytree(source / original, part, symlinks=True, dirs_exist_ok=True, ignore=_LEFT_BEHIND)
                 robot.write(part / "mobility.urdf")
             table.setdefault(category, []).append(name)

@@ -92,7 +92,7 @@ class Cabinet:
     def boards(self) -> list[Box]:
         d, w, h = self.size
         t = THICK / 2
-        flat = lambda z: _box((0, 0, z), (d / 2, w / 2, t))  # noqa: E731
+        flat = lambda z: _box((0, 0, z), (d / 2, w / 2, t))
         walls = [_box((0, y, 0), (d / 2, t, h / 2)) for y in (-w / 2 + t, w / 2 - t)]
         shelves = [flat(h / 2 * (k + 1) / (self.shelves + 1)) for k in range(self.shelves)]
         back = _box((d / 2 - t, 0, 0), (t, w / 2, h / 2))
@@ -155,7 +155,7 @@ def scene_bank(objects: list[Cabinet]) -> SceneBank:
             quat = frame.as_quat(scalar_first=True)
             scenes.append((cabinet, name, part, part.anchor, quat, frame.inv().apply(part.axis)))
     rows = statics + parts
-    column = lambda f, dtype=None: np.array([f(*scene) for scene in scenes], dtype)  # noqa: E731
+    column = lambda f, dtype=None: np.array([f(*scene) for scene in scenes], dtype)
     return SceneBank(
         collision="hull",
         hull_vertices=np.concatenate(vertices),

@@ -6,12 +6,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from vatmart_jax.perception.grouped_views import Clouds
-from vatmart_jax.perception.pointnet2 import PointNetConfig, group
-from vatmart_jax.perception.trainer import Samples
+from vatmart_jax.perception.grouped_views import GroupedViews
+from vatmart_jax.perception.pointnet2 import PointNet2Config, group
+from vatmart_jax.perception.trainer import Interactions
 
 
-def boxes(seed: int, views: int, config: PointNetConfig, contacts: int = 32) -> tuple[Clouds, np.ndarray]:
+def boxes(seed: int, views: int, config: PointNet2Config, contacts: int = 32) -> tuple[GroupedViews, np.ndarray]:
     """Boxes seen from the front; contacts lie on the front. Returns also the front's inward normals [V, 3]."""
     rng = np.random.default_rng(seed)
     points, touch, normals = [], [], []
@@ -31,27 +31,29 @@ def boxes(seed: int, views: int, config: PointNetConfig, contacts: int = 32) -> 
         touch.append(face(0, -1, contacts))
         normals.append(turn[:, 0])
     points, touch = jnp.asarray(np.stack(points), jnp.float16), jnp.asarray(np.stack(touch), jnp.float32)
-    grouping = jax.jit(jax.vmap(lambda p, c: group(p, c, config)))(points, touch)
-    return Clouds(points, grouping), np.stack(normals)
+    point_groups = jax.jit(jax.vmap(lambda p, c: group(p, c, config)))(points, touch)
+    return GroupedViews(points, point_groups), np.stack(normals)
 
 
-def outcome(clouds: Clouds, normals: np.ndarray, view, contact, trajectory) -> tuple[np.ndarray, np.ndarray]:
+def outcome(
+    grouped_views: GroupedViews, normals: np.ndarray, view, contact, trajectory
+) -> tuple[np.ndarray, np.ndarray]:
     """(moved, valid) of trajectories [..., 30]: valid where the hand comes along the normal, to the upper half."""
     n = normals[view]
     while n.ndim < np.ndim(trajectory):
         n = n[..., None, :]
     trajectory = np.asarray(trajectory)
     moves = trajectory[..., 6:].reshape(*trajectory.shape[:-1], 4, 6)[..., :3].sum(-2)
-    point = np.asarray(clouds.contacts)[view, contact]
-    upper = point[..., 2] > np.asarray(clouds.contacts)[..., 2].mean(-1)[view]
+    point = np.asarray(grouped_views.contacts)[view, contact]
+    upper = point[..., 2] > np.asarray(grouped_views.contacts)[..., 2].mean(-1)[view]
     upper = upper.reshape(upper.shape + (1,) * (np.ndim(trajectory) - 1 - upper.ndim))
     return np.maximum((moves * n).sum(-1), 0), ((trajectory[..., :3] * n).sum(-1) > 0.9) & upper
 
 
-def samples(seed: int, clouds: Clouds, normals: np.ndarray, count: int, task=(0.1, 0.5)) -> Samples:
+def samples(seed: int, grouped_views: GroupedViews, normals: np.ndarray, count: int, task=(0.1, 0.5)) -> Interactions:
     """Noisy pushes along the normal, and what they did."""
     rng = np.random.default_rng(seed)
-    view, contact = rng.integers(0, len(clouds), count), rng.integers(0, clouds.contacts.shape[1], count)
+    view, contact = rng.integers(0, len(grouped_views), count), rng.integers(0, grouped_views.contacts.shape[1], count)
     n = normals[view]
     up = n + rng.normal(size=n.shape) * 0.25
     up /= np.linalg.norm(up, axis=-1, keepdims=True)
@@ -62,8 +64,8 @@ def samples(seed: int, clouds: Clouds, normals: np.ndarray, count: int, task=(0.
     total = (n + rng.normal(size=n.shape) * 0.2) * (commanded * rng.uniform(0.7, 1.4, count))[:, None]
     residuals = np.concatenate([share[..., None] * total[:, None], rng.normal(size=(count, 4, 3)) * 0.05], -1)
     trajectory = np.concatenate([up, forward, residuals.reshape(count, -1)], -1).astype(np.float32)
-    moved, valid = outcome(clouds, normals, view, contact, trajectory)
-    return Samples(
+    moved, valid = outcome(grouped_views, normals, view, contact, trajectory)
+    return Interactions(
         jnp.asarray(view, jnp.int32), jnp.asarray(contact, jnp.int32), jnp.asarray(commanded, jnp.float32),
         jnp.asarray(trajectory), jnp.asarray(moved, jnp.float32), jnp.asarray(valid), jnp.zeros(count, bool),
     )  # fmt: skip

@@ -140,7 +140,7 @@ def test_parts_swing_free(objects):
             moving = set(obj.subtree(part.link))
             for share in (0.0, 0.1, 0.5, 1.0):
                 poses = obj.link_poses({part.joint: part.closed + part.sign * share * part.width})
-                at = lambda k, v, poses=poses: v.vertices @ poses[k][:3, :3].T + poses[k][:3, 3]  # noqa: E731
+                at = lambda k, v, poses=poses: v.vertices @ poses[k][:3, :3].T + poses[k][:3, 3]
                 points = np.concatenate([at(k, v) for k in moving for v in obj.links[k].visuals])
                 for k, link in obj.links.items():
                     for v in link.visuals if k not in moving else ():

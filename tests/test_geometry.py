@@ -19,7 +19,7 @@ matrix_from_quat, quat_from_matrix = jax.jit(rot.matrix_from_quat), jax.jit(rot.
 matrix_from_rotvec, rotvec_from_matrix = jax.jit(rot.matrix_from_rotvec), jax.jit(rot.rotvec_from_matrix)
 matrix_from_euler, euler_from_matrix = jax.jit(rot.matrix_from_euler), jax.jit(rot.euler_from_matrix)
 matrix_from_rot6d = jax.jit(rot.matrix_from_rot6d)
-cone_direction = jax.jit(rot.cone_direction)
+sample_cone_direction = jax.jit(rot.sample_cone_direction)
 pack_trajectory, unpack_trajectory = jax.jit(pack_trajectory), jax.jit(unpack_trajectory)
 
 
@@ -105,7 +105,9 @@ def test_rotate_and_unrotate_are_products_with_a_matrix_and_its_transpose():
 def test_cone_directions_are_uniform_on_the_cap(half_angle_deg):
     half_angle = np.radians(half_angle_deg)
     axis = np.array([1.0, 2, -2]) / 3
-    directions = np.asarray(cone_direction(jax.random.key(0), jnp.tile(jnp.asarray(axis), (20_000, 1)), half_angle))
+    directions = np.asarray(
+        sample_cone_direction(jax.random.key(0), jnp.tile(jnp.asarray(axis), (20_000, 1)), half_angle)
+    )
     assert_same(np.linalg.norm(directions, axis=-1), 1, 1e-5)
     cosine = directions @ axis
     assert cosine.min() >= np.cos(half_angle) - 1e-5

@@ -155,7 +155,7 @@ def test_a_face_stored_twice_or_without_area_is_read_once_or_not():
 @pytest.fixture(scope="module")
 def oracles(real_objects) -> list[tuple[PartNetObject, yourdfpy.URDF]]:
     names = ("45194", "101808", "101612")
-    urdf = lambda name: yourdfpy.URDF.load(str(real_objects / name / "mobility.urdf"), load_meshes=False)  # noqa: E731
+    urdf = lambda name: yourdfpy.URDF.load(str(real_objects / name / "mobility.urdf"), load_meshes=False)
     return [(read_object(real_objects / name), urdf(name)) for name in names]
 
 

@@ -139,7 +139,7 @@ def test_what_is_no_picture_is_said(tmp_path):
 
 def test_a_changed_picture_is_converted_again_where_textures_are_asked_for(tmp_path):
     folder = write(tmp_path / "1")
-    keys = lambda: [_key(folder, ConvertConfig(textures=t), None) for t in (False, True)]  # noqa: E731
+    keys = lambda: [_key(folder, ConvertConfig(textures=t), None) for t in (False, True)]
     before = keys()
     Image.new("RGB", (4, 4)).save(folder / "images" / "wood.jpg")
     after = keys()

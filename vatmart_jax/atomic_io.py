@@ -11,7 +11,7 @@ from typing import Any
 
 
 @contextmanager
-def whole(path: Path | str) -> Iterator[Path]:
+def atomic_write(path: Path | str) -> Iterator[Path]:
     """Where to write a file: what the block leaves there becomes `path`, unless the block raises.
 
     The name ends in .part, whatever the suffix of `path`: say the format to what would guess it.
@@ -26,7 +26,7 @@ def whole(path: Path | str) -> Iterator[Path]:
 
 
 @contextmanager
-def whole_folder(path: Path | str) -> Iterator[Path]:
+def atomic_directory(path: Path | str) -> Iterator[Path]:
     """A new folder to write into: it becomes `path` (in place of one that is there), unless the block raises."""
     path = Path(path)
     part, old = (path.with_name(f".{path.name}.{end}") for end in ("part", "old"))
@@ -42,7 +42,7 @@ def whole_folder(path: Path | str) -> Iterator[Path]:
 
 
 def write_bytes(path: Path, content: bytes) -> None:
-    with whole(path) as part:
+    with atomic_write(path) as part:
         part.write_bytes(content)
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from dataclasses import asdict, fields, is_dataclass
+from dataclasses import MISSING, asdict, fields, is_dataclass
 from typing import Any, TypeVar, get_args, get_origin, get_type_hints
 
 T = TypeVar("T")
@@ -15,15 +15,20 @@ def to_json(config: Any) -> dict[str, Any]:
 
 
 def from_json(kind: type[T], value: Any, where: str = "config") -> T:
-    """The dataclass `kind` with the fields of a JSON object; ValueError names the field that does not fit."""
+    """The dataclass `kind` with the fields of a JSON object; those that it lacks take their defaults.
+
+    So a new field's default is what was done before it existed, or the format's number rises and a migration fills it
+    in. Raises ValueError, which names the field, for one that is unknown, does not fit, or is missing without default.
+    """
     if not isinstance(value, dict):
         raise ValueError(f"{where}: expected an object, found {type(value).__name__}")
     hints = get_type_hints(kind)
-    names = {f.name for f in fields(kind)}  # pyright: ignore[reportArgumentType]
-    wrong = sorted(names ^ value.keys())
+    known = {f.name: f for f in fields(kind)}  # pyright: ignore[reportArgumentType]
+    needed = {name for name, f in known.items() if f.default is MISSING and f.default_factory is MISSING}
+    wrong = sorted((value.keys() - known.keys()) | (needed - value.keys()))
     if wrong:
         raise ValueError(f"{where}: fields {', '.join(wrong)} are missing or unknown")
-    return kind(**{name: _parsed(hints[name], value[name], f"{where}.{name}") for name in names})
+    return kind(**{name: _parsed(hints[name], found, f"{where}.{name}") for name, found in value.items()})
 
 
 def _parsed(kind: Any, value: Any, where: str) -> Any:

@@ -8,7 +8,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
 
 
-class Bars:
+class ConsoleReporter:
     """One bar per stage; call it with (stage, done, total, metrics). Use as a context manager."""
 
     _SECONDS_BETWEEN_LINES = 10.0
@@ -21,7 +21,7 @@ class Bars:
         self._tasks: dict[str, TaskID] = {}
         self._console, self._printed = console, 0.0
 
-    def __enter__(self) -> Bars:
+    def __enter__(self) -> ConsoleReporter:
         if self._terminal:
             self._progress.start()
         return self
@@ -41,6 +41,6 @@ class Bars:
             self._printed = time.monotonic()
             self._console.print(f"{stage} {done}/{total}  {note}", highlight=False, soft_wrap=True)
 
-    def say(self, text: str) -> None:
+    def info(self, text: str) -> None:
         """One line above the bars."""
         self._console.print(text, highlight=False, soft_wrap=True)

@@ -112,7 +112,7 @@ def unrotate(m: jax.Array, v: jax.Array) -> jax.Array:
     return jnp.einsum("...ji,...j->...i", m, v)
 
 
-def cone_direction(key: jax.Array, axis: jax.Array, half_angle: float) -> jax.Array:
+def sample_cone_direction(key: jax.Array, axis: jax.Array, half_angle: float) -> jax.Array:
     """Unit vectors uniform in the cone of `half_angle` (rad) about unit `axis` [..., 3]. Consumes the key."""
     k1, k2 = jax.random.split(key)
     cosine = jax.random.uniform(k1, (*axis.shape[:-1], 1), minval=jnp.cos(half_angle), maxval=1.0)
@@ -126,7 +126,9 @@ def gripper_frame(up: jax.Array, forward: jax.Array) -> jax.Array:
     return matrix_from_rot6d(jnp.concatenate([up, forward], -1))
 
 
-def carried(point: jax.Array, axis: jax.Array, anchor: jax.Array, amount: jax.Array, hinge: bool) -> jax.Array:
+def apply_joint_motion(
+    point: jax.Array, axis: jax.Array, anchor: jax.Array, amount: jax.Array, hinge: bool
+) -> jax.Array:
     """[..., 3] where points [..., 3] of a part come to when its joint moves by `amount` [...], rad or unit lengths.
 
     axis: [..., 3] unit; anchor: [..., 3] a point on a hinge's axis.

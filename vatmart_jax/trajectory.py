@@ -35,6 +35,6 @@ def unpack_trajectory(trajectory: jax.Array) -> tuple[jax.Array, jax.Array]:
     return matrix_from_rot6d(trajectory[..., :6]), residuals
 
 
-def since_start(trajectory: jax.Array) -> jax.Array:
+def cumulative_residuals(trajectory: jax.Array) -> jax.Array:
     """[..., 30] -> [..., 4, 6]: after each waypoint, the fingertips' move and the Euler angles since the start pose."""
     return jnp.cumsum(trajectory[..., 6:].reshape(*trajectory.shape[:-1], WAYPOINTS, 6), -2)

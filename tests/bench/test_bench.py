@@ -11,12 +11,12 @@ from vatmart_jax import bench, cli, presets
 from vatmart_jax.data.banks import HINGE
 from vatmart_jax.envs.env import TASKS, Env
 from vatmart_jax.perception.networks import NetworksConfig
-from vatmart_jax.perception.pointnet2 import Level, PointNetConfig
+from vatmart_jax.perception.pointnet2 import PointNet2Config, SetAbstraction
 from vatmart_jax.pipeline.exploration import start_pool
 
-TINY = PointNetConfig(
+TINY = PointNet2Config(
     n_points=64,
-    levels=(Level(16, 0.3, 8, (16, 16)), Level(4, 0.8, 8, (16, 16))),
+    levels=(SetAbstraction(16, 0.3, 8, (16, 16)), SetAbstraction(4, 0.8, 8, (16, 16))),
     propagation=((16,), (16,)),
     feature_dim=16,
 )
@@ -74,15 +74,15 @@ def test_random_trials_repeat_exactly_open_loop(cabinets):
     closed = jax.jit(lambda start: bench.random_trials(env, start, key))(start)
     # Until they succeed: a trial stops there, its trajectory stays.
     again = jax.jit(env.execute)(start, closed.residuals)
-    assert again.valid.all() and (np.abs(again.moved) > 0.05).mean() > 0.5
+    assert again.valid.all() and (np.abs(again.displacement) > 0.05).mean() > 0.5
     unfinished = ~np.asarray(closed.success)
-    np.testing.assert_allclose(again.moved[unfinished], closed.moved[unfinished], atol=1e-5)
+    np.testing.assert_allclose(again.displacement[unfinished], closed.displacement[unfinished], atol=1e-5)
 
 
 def test_perception_times_every_stage(data, capsys, monkeypatch):
     quick = presets.PRESETS["quick"]
     small = replace(
-        quick.perception, networks=NetworksConfig(pointnet=TINY), views=2, queries=4, probes=2, proposals=4, best=2
+        quick.perception, networks=NetworksConfig(encoder=TINY), views=2, queries=4, probes=2, proposals=4, best=2
     )
     monkeypatch.setitem(presets.PRESETS, "quick", replace(quick, perception=small))
     result = run(capsys, "perception", "--data", str(data[0]), "--preset", "quick", "--seconds", "0.05")

@@ -22,7 +22,7 @@ def solids(bank: SceneBank, scene: int) -> list[list[np.ndarray]]:
     out = []
     for start in (bank.static_start, bank.part_start):
         rows = range(start[scene], start[scene + 1])
-        turn = lambda row: Rotation.from_quat(bank.instance_quat[row], scalar_first=True)  # noqa: E731
+        turn = lambda row: Rotation.from_quat(bank.instance_quat[row], scalar_first=True)
         out.append([turn(r).apply(bank.hull(bank.instance_shape[r])) + bank.instance_pos[r] for r in rows])
     return out
 
@@ -173,7 +173,7 @@ def test_joined_banks_hold_the_scenes_and_views_of_each(cabinets, convert):
             for was, now in zip(solids(bank, old), solids(joined, new), strict=True):
                 np.testing.assert_array_equal(now, was)
     else:
-        rows = lambda b, s: b.box_size[b.instance_shape[b.static_start[s] : b.static_start[s + 1]]]  # noqa: E731
+        rows = lambda b, s: b.box_size[b.instance_shape[b.static_start[s] : b.static_start[s + 1]]]
         for new, old in enumerate(order):
             np.testing.assert_array_equal(rows(joined, new), rows(bank, old))
     assert_same(together, joined)  # every shape is used, once

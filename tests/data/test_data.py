@@ -46,7 +46,7 @@ def test_more_folders_add_their_training_splits_and_nothing_else(cabinets, tmp_p
     folders = tmp_path / "own", tmp_path / "more"
     found = {}
     for name, data in (("one", Data(folders[0])), ("both", Data(*folders))):
-        envs = (data.env(split, TASKS["push-drawer"], "c", EnvConfig(batch=4), PhysicsConfig()) for split in SPLITS)
+        envs = (data.env(split, TASKS["push-drawer"], "c", EnvConfig(num_envs=4), PhysicsConfig()) for split in SPLITS)
         found[name] = [env.bank.object_id.tolist() for env in envs]
     assert found["both"][0] == found["one"][0] + [f"more-{i}" for i in found["one"][0]]
     assert found["both"][1:] == found["one"][1:]

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from vatmart_jax import rotations as rot
 from vatmart_jax.data.banks import HINGE, SceneBank, ViewBank
-from vatmart_jax.envs.env import ACTION, OBSERVATION, TASKS, Env, EnvConfig, EnvState, Start, reward_terms
+from vatmart_jax.envs.env import ACTION, OBSERVATION, TASKS, Env, EnvConfig, EnvState, TrialStart, reward_terms
 from vatmart_jax.trajectory import WAYPOINTS, unpack_trajectory
 
 BATCH = 16
@@ -22,23 +22,23 @@ def jit(f):
     return jax.jit(f, compiler_options={"xla_backend_optimization_level": 0})
 
 
-class Run:
+class Trials:
     """An environment with its functions jitted."""
 
     def __init__(self, cabinets: tuple[SceneBank, ViewBank], task: str):
-        self.env = Env(*cabinets, TASKS[task], config=EnvConfig(batch=BATCH))
+        self.env = Env(*cabinets, TASKS[task], config=EnvConfig(num_envs=BATCH))
         self.reset, self.step = jit(self.env.reset), jit(self.env.step)
-        self.begin, self.execute = jit(self.env.begin), jit(self.env.execute)
+        self.begin, self.execute = jit(self.env.begin_trials), jit(self.env.execute)
         self.sample = jit(lambda key: self.env.sample(key, 5000))
 
-    def starts(self, contacts: slice, forward, task: float) -> Start:
+    def starts(self, contacts: slice, forward, task: float) -> TrialStart:
         """Every view at several of its contacts, head on, with one task."""
         views = self.env.views
         view = np.resize(np.arange(len(views)), BATCH)
         contact = np.resize(np.arange(16)[contacts], BATCH)
         up = -views.contact_normals[view, contact]
         rotation = rot.gripper_frame(jnp.asarray(up), jnp.broadcast_to(jnp.asarray(forward, jnp.float32), up.shape))
-        return Start(
+        return TrialStart(
             jnp.asarray(view, jnp.int32), jnp.asarray(contact, jnp.int32), jnp.full(BATCH, task), rotation
         )  # fmt: skip
 
@@ -54,16 +54,16 @@ class Run:
             then = contact + axis * share
         move = then - (contact if env.task.opening else tip)
         turn = axis * share if hinge else jnp.zeros_like(axis)
-        return jnp.concatenate([move / env.config.move_range, turn / env.config.turn_range], -1)
+        return jnp.concatenate([move / env.config.max_translation, turn / env.config.max_rotation], -1)
 
 
 @pytest.fixture(scope="module")
 def runs(cabinets):
-    made: dict[str, Run] = {}
+    made: dict[str, Trials] = {}
 
-    def run(task: str) -> Run:
+    def run(task: str) -> Trials:
         if task not in made:
-            made[task] = Run(cabinets, task)
+            made[task] = Trials(cabinets, task)
         return made[task]
 
     return run
@@ -106,7 +106,7 @@ def test_resets_are_determined_by_their_key(runs):
     run = runs("push-door")
     a, b, c = run.reset(KEY), run.reset(KEY), run.reset(jax.random.key(1))
     assert all((x == y).all() for x, y in zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True))
-    assert (a.start.task != c.start.task).all()
+    assert (a.start.goal != c.start.goal).all()
 
 
 @pytest.mark.parametrize("task", TASKS)
@@ -114,11 +114,11 @@ def test_tasks_fit_the_room_and_approaches_the_cone(runs, task):
     env, start = runs(task).env, runs(task).sample(KEY)
     q, width = env.views.q[start.view], env.bank.width[env.views.scene[start.view]]
     room = width - q if env.task.opening else q
-    assert (start.task >= env.task.low - 1e-6).all()
-    assert (start.task <= np.minimum(env.task.high, room) + 1e-6).all()
+    assert (start.goal >= env.task.low - 1e-6).all()
+    assert (start.goal <= np.minimum(env.task.high, room) + 1e-6).all()
     assert np.isin(np.unique(env.views.opening[start.view]), [env.task.opening])
     inward = -env.views.contact_normals[start.view, start.contact]
-    assert ((np.asarray(start.rotation)[:, :, 2] * inward).sum(-1) > np.cos(env.config.cone) - 1e-5).all()
+    assert ((np.asarray(start.rotation)[:, :, 2] * inward).sum(-1) > np.cos(env.config.approach_cone) - 1e-5).all()
     np.testing.assert_allclose(np.linalg.det(start.rotation), 1, atol=1e-4)
     if task.startswith("pull"):
         share = env.views.contact_handle[start.view, start.contact].mean()
@@ -130,7 +130,7 @@ def test_the_task_given_the_view_is_that_of_a_uniform_task_and_then_a_uniform_st
     env, rng = runs(task).env, np.random.default_rng(0)
     view = 1
     q, width = env.views.q[view], env.bank.width[env.views.scene[view]]
-    ours = np.asarray(env.sample_task(KEY, jnp.full(2000, view)))
+    ours = np.asarray(env.sample_goal(KEY, jnp.full(2000, view)))
     t = rng.uniform(env.task.low, min(env.task.high, width), 2_000_000)
     start = rng.uniform(0, width - t) if env.task.opening else rng.uniform(t, width)
     theirs = t[np.abs(start - q) < 0.002 * width]
@@ -157,7 +157,7 @@ def test_trials_can_begin_at_a_pool_of_known_starts(runs):
         for v, c in zip(*map(np.asarray, (state.start.view, state.start.contact)), strict=True)
     ]
     assert all(len(r) == 1 for r in rows) and len({int(r[0]) for r in rows}) > 2
-    assert len(np.unique(state.start.task)) == BATCH
+    assert len(np.unique(state.start.goal)) == BATCH
 
 
 class Awning(Cabinet):
@@ -175,13 +175,13 @@ def test_a_hand_that_an_obstacle_stops_on_the_way_leaves_no_way():
     view, contact = (x.ravel() for x in np.meshgrid(np.arange(3), np.arange(8)))
     up = jnp.asarray(-env.views.contact_normals[view, contact])
     starts = {
-        side: Start(
+        side: TrialStart(
             jnp.asarray(view, jnp.int32), jnp.asarray(contact, jnp.int32), jnp.full(24, 0.1),
             rot.gripper_frame(up, jnp.broadcast_to(jnp.asarray(axis, jnp.float32), up.shape)),
         )
         for side, axis in (("upright", [0, 1, 0]), ("flat", [0, 0, 1]))
     }  # fmt: skip
-    free, way = jit(env.is_free), jit(env.leaves_way)
+    free, way = jit(env.is_collision_free), jit(env.path_is_free)
     height = env.views.contacts[view, contact][:, 2]
     upright, flat = (np.asarray(free(starts[side])) for side in ("upright", "flat"))  # the others are at the handle
     assert (upright & (height > -0.1)).any() and (upright & (height < -0.13)).any() and flat.any()
@@ -199,7 +199,7 @@ def test_the_first_observation_says_where_the_hand_the_contact_and_the_joint_are
         views, bank = env.views, env.bank
         scene, near = views.scene[start.view], {"atol": 1e-5}
         frame = np.asarray(state.frame)
-        local = lambda v, frame=frame: np.einsum("bji,bj->bi", frame, v)  # noqa: E731
+        local = lambda v, frame=frame: np.einsum("bji,bj->bi", frame, v)
         np.testing.assert_allclose(obs[:, :3], [[0, 0.2, 0.2]] * BATCH, **near)
         up = np.asarray(start.rotation)[:, :, 2]
         np.testing.assert_allclose(obs[:, 3:6], local(-(0.1122 + env.config.standoff) * up), **near)
@@ -226,8 +226,8 @@ def turned(cabinets: tuple[SceneBank, ViewBank], angle: float) -> tuple[SceneBan
     """The same cabinets, turned about z."""
     bank, views = cabinets
     turn = Rotation.from_rotvec([0, 0, angle])
-    along = lambda quat: (turn * Rotation.from_quat(quat, scalar_first=True)).as_quat(scalar_first=True)  # noqa: E731
-    apply = lambda v: turn.apply(v.reshape(-1, 3)).reshape(v.shape).astype(v.dtype)  # noqa: E731
+    along = lambda quat: (turn * Rotation.from_quat(quat, scalar_first=True)).as_quat(scalar_first=True)
+    apply = lambda v: turn.apply(v.reshape(-1, 3)).reshape(v.shape).astype(v.dtype)
     static = np.arange(len(bank.instance_shape)) < bank.static_start[-1]
     return (
         replace(
@@ -244,7 +244,7 @@ def turned(cabinets: tuple[SceneBank, ViewBank], angle: float) -> tuple[SceneBan
 @pytest.mark.parametrize("task", ["push-door", "push-drawer"])
 def test_the_policy_sees_the_same_when_the_whole_scene_is_turned(cabinets, runs, task):
     angle = 0.7
-    run, other = runs(task), Run(turned(cabinets, angle), task)
+    run, other = runs(task), Trials(turned(cabinets, angle), task)
     start = run.starts(slice(16), [0.3, 0.2, 1], 0.2)
     matrix = jnp.asarray(Rotation.from_rotvec([0, 0, angle]).as_matrix(), jnp.float32)
     a, b = run.begin(start), other.begin(start.replace(rotation=matrix @ start.rotation))
@@ -254,8 +254,8 @@ def test_the_policy_sees_the_same_when_the_whole_scene_is_turned(cabinets, runs,
         return  # one joint type's physics are enough
     actions = run.expert(a) + 0.1 * random_actions(0)
     a, b = run.step(a, actions), other.step(b, actions)
-    assert (np.abs(a.moved) > 0.01).any()
-    np.testing.assert_allclose(a.moved, b.moved, atol=2e-3)
+    assert (np.abs(a.displacement) > 0.01).any()
+    np.testing.assert_allclose(a.displacement, b.displacement, atol=2e-3)
     np.testing.assert_allclose(a.obs, b.obs, atol=1e-2)
 
 
@@ -268,27 +268,27 @@ def test_pushing_straight_on_the_front_closes_the_part_and_is_a_success(runs, ta
         state = run.step(state, run.expert(state))
     np.testing.assert_array_equal(state.success, begun.valid)
     assert state.done.all()
-    error = np.abs(state.moved - state.start.task)[begun.valid]
-    assert error.max() < run.env.config.tolerance * state.start.task[0]
-    np.testing.assert_allclose(begun.physics.qpos[:, 0] - state.physics.qpos[:, 0], state.moved, atol=1e-6)
+    error = np.abs(state.displacement - state.start.goal)[begun.valid]
+    assert error.max() < run.env.config.tolerance * state.start.goal[0]
+    np.testing.assert_allclose(begun.physics.qpos[:, 0] - state.physics.qpos[:, 0], state.displacement, atol=1e-6)
 
 
 def test_a_drawers_bar_is_grasped_across_and_pulled_open(runs):
     run = runs("pull-drawer")
     state = begun = run.begin(run.starts(slice(8, 16), [0, 1, 0], 0.15))
-    assert begun.held.all() and begun.valid.all() and not begun.in_collision.any()
+    assert begun.grasp_held.all() and begun.valid.all() and not begun.in_collision.any()
     # The bar is 0.015 thick.
     np.testing.assert_allclose(begun.physics.qpos[:, 7:].sum(-1), 0.015, atol=2e-3)
     for _ in range(WAYPOINTS):
         state = run.step(state, run.expert(state))
-    assert state.success.all() and state.held.all()
+    assert state.success.all() and state.grasp_held.all()
     assert (state.physics.qpos[:, 0] > begun.physics.qpos[:, 0] + 0.1).all()
 
 
 def test_a_grasp_of_the_bare_panel_fails_and_ends_the_trial(runs):
     run = runs("pull-drawer")
     state = run.begin(run.starts(slice(0, 8), [0, 1, 0], 0.15))
-    assert not state.held.any() and state.done.all() and not state.valid.any()
+    assert not state.grasp_held.any() and state.done.all() and not state.valid.any()
     after = run.step(state, random_actions(0))
     assert not after.success.any() and (after.trajectory[:, 6:] == 0).all()
 
@@ -307,11 +307,11 @@ def test_starts_in_collision_are_invalid_and_stay_as_they_are(runs):
     for _ in range(WAYPOINTS):
         state = run.step(state, run.expert(state))
     np.testing.assert_array_equal(state.success, ~colliding)
-    np.testing.assert_array_equal(state.physics.exact[colliding], begun.physics.exact[colliding])
+    np.testing.assert_array_equal(state.physics.backend_state[colliding], begun.physics.backend_state[colliding])
     assert (state.trajectory[colliding, 6:] == 0).all() and (state.reward[colliding] == 0).all()
     again = run.execute(start, state.residuals)
     np.testing.assert_array_equal(again.success, ~colliding)
-    np.testing.assert_array_equal(again.moved[colliding], 0)
+    np.testing.assert_array_equal(again.displacement[colliding], 0)
 
 
 @pytest.mark.parametrize("task", ["push-door", "pull-drawer"])
@@ -336,14 +336,14 @@ def test_a_recorded_trajectory_repeats_the_motion_and_is_zero_after_the_end(runs
 def test_open_loop_trials_count_only_how_they_end(runs):
     run = runs("push-door")
     start = run.starts(slice(8), [0, 0, 1], 0.2)
-    far = run.begin(start.replace(task=jnp.full(BATCH, 0.8)))
+    far = run.begin(start.replace(goal=jnp.full(BATCH, 0.8)))
     for _ in range(WAYPOINTS):
         far = run.step(far, run.expert(far))
     # The first waypoint of a long push is a short task's success, its end is not.
     past = run.execute(start, far.residuals)
     assert (np.abs(past.progress[:, 0] - 0.2) < 0.03).any()
     assert not past.success.any() and past.valid.all()
-    exact = run.execute(start.replace(task=far.moved), far.residuals)
+    exact = run.execute(start.replace(goal=far.displacement), far.residuals)
     assert exact.success.all()
 
 
@@ -359,9 +359,9 @@ def test_rewards_are_the_papers(runs):
     state = run.begin(run.starts(slice(8), [0, 0, 1], 0.4))
     for k in range(WAYPOINTS):
         before, state = state, run.step(state, run.expert(state) + 0.2 * random_actions(k))
-        left = [np.abs(s.start.task - s.moved) for s in (before, state)]
+        left = [np.abs(s.start.goal - s.displacement) for s in (before, state)]
         d = np.asarray(state.info["tip_distance"])
-        success = np.abs(state.start.task - state.moved) <= 0.15 * state.start.task
+        success = np.abs(state.start.goal - state.displacement) <= 0.15 * state.start.goal
         expected = 300 * (left[0] - left[1]) - 150 * d - 300 * (d > 0.1) + 500 * success
         np.testing.assert_allclose(state.reward, np.where(before.done, 0, expected), atol=0.05)
 
@@ -373,8 +373,8 @@ def test_a_hand_strains_as_far_as_it_is_from_where_it_was_sent(runs):
     across = stay.at[:, 0, 2].set(0.1)  # the drawer gives way along its axis only
     for residuals, low, high in ((stay, 0.0, 0.01), (across, 0.03, 0.1)):
         state = run.execute(begun.start, residuals)
-        strain = np.asarray(run.env.strain(state))
-        assert state.held.all() and (strain >= low).all() and (strain < high).all()
+        tracking_penalty = np.asarray(run.env.tracking_error(state))
+        assert state.grasp_held.all() and (tracking_penalty >= low).all() and (tracking_penalty < high).all()
 
 
 def test_a_nan_action_fails_its_own_trial_and_no_other(runs):

@@ -17,24 +17,31 @@ import numpy as np
 
 from conversion.convert import ConvertConfig, convert
 from mjcf_assets.generator import generate
-from vatmart_jax.data.banks import SceneBank, ViewBank
 from vatmart_jax.cli.main import COMMANDS, main
+from vatmart_jax.data.banks import SceneBank, ViewBank
 from vatmart_jax.data.dataset import Data
 from vatmart_jax.envs.env import TASKS, EnvConfig
-from vatmart_jax.priors.priors import Priors
 from vatmart_jax.perception.networks import NetworksConfig
-from vatmart_jax.perception.pointnet2 import Around, Level, PointNetConfig
+from vatmart_jax.perception.pointnet2 import LocalGroup, PointNet2Config, SetAbstraction
 from vatmart_jax.perception.trainer import PerceptionConfig
 from vatmart_jax.physics import PhysicsConfig
-from vatmart_jax.pipeline.exploration import ExploreConfig
-from vatmart_jax.pipeline.run_dir import Run, read_metrics
-from vatmart_jax.pipeline.trainer import Training
+from vatmart_jax.pipeline.exploration import ExplorationConfig
 from vatmart_jax.pipeline.presets import PRESETS, EvaluationConfig, Schedule, Settings
+from vatmart_jax.pipeline.run_dir import RunDir, read_metrics
+from vatmart_jax.pipeline.trainer import PipelineTrainer
 from vatmart_jax.priors.pretrained import names, run_folder
+from vatmart_jax.priors.priors import Priors
 from vatmart_jax.rl.td3 import TD3Config
 from vatmart_jax.workflows.train import resolve
 
-RENAMED: dict[str, str] = {}
+RENAMED: dict[str, str] = {
+    "flow": "course",
+    "flow_error": "course_error",
+    "flow_loss": "course_loss",
+    "axis_loss": "hinge_loss",
+    "position_loss": "move_loss",
+    "euler_loss": "turn_loss",
+}
 """New name -> golden name, of arrays, metrics and stages."""
 
 RUNS = ("push-drawer", "push-door", "pull-door")
@@ -49,28 +56,59 @@ HELP = {
 
 # Preset `quick` in small: door hinges, local networks, Muon, every stage.
 _DOOR = Settings(
-    env=EnvConfig(batch=16),
+    env=EnvConfig(num_envs=16),
     physics=PhysicsConfig(steps_per_waypoint=50),
-    explore=ExploreConfig(
-        td3=TD3Config(hidden=32, batch=32, capacity=1000, updates=4), iterations=4, pool=32, warmup=2
+    explore=ExplorationConfig(
+        td3=TD3Config(hidden=32, batch_size=32, buffer_size=1000, grad_steps_per_iter=4),
+        iterations=4,
+        pool=32,
+        warmup=2,
     ),
     perception=PerceptionConfig(
         networks=NetworksConfig(
-            pointnet=PointNetConfig(
-                64, (Level(16, 0.3, 4, (16,)), Level(4, 0.8, 4, (16,))), ((16,), (16,)), 16, (Around(0.15, 8, (8,)),),
+            encoder=PointNet2Config(
+                64,
+                (SetAbstraction(16, 0.3, 4, (16,)), SetAbstraction(4, 0.8, 4, (16,))),
+                ((16,), (16,)),
+                16,
+                (LocalGroup(0.15, 8, (8,)),),
                 (8,),
             ),
-            course=(16,), hinge=True, hand=(8,), trajectory=(16,), posterior=(16,), decoder=(16,), scorer=(16,),
-            actionability=(16,), latent_dim=8, contact_dim=8, task_dim=8,
+            flow_hidden=(16,),
+            predict_axis=True,
+            gripper_patch_hidden=(8,),
+            trajectory_hidden=(16,),
+            posterior_hidden=(16,),
+            decoder_hidden=(16,),
+            scorer_hidden=(16,),
+            actionability_hidden=(16,),
+            latent_dim=8,
+            contact_dim=8,
+            task_dim=8,
         ),
-        views=2, queries=4, probes=2, proposals=4, best=2, steps_per_call=3,
+        views_per_batch=2,
+        samples_per_view=4,
+        actionability_queries=2,
+        num_proposals=4,
+        top_k=2,
+        log_every=3,
     ),
     schedule=Schedule(
-        samples=512, collect=2, course=3, scorer=3, proposal=3, actionability=3, curiosity=1, curiosity_iterations=1,
-        curiosity_steps=3, finetune=1, finetune_batches=1, finetune_steps=3,
+        buffer_size=512,
+        collect_batches=2,
+        flow_steps=3,
+        scorer_steps=3,
+        proposal_steps=3,
+        actionability_steps=3,
+        curiosity_rounds=1,
+        curiosity_iterations=1,
+        curiosity_steps=3,
+        finetune_rounds=1,
+        finetune_batches=1,
+        finetune_steps=3,
     ),
-    evaluation=EvaluationConfig(trials=24, proposals=4, copies=2),
-)  # fmt: skip
+    evaluation=EvaluationConfig(trials=24, num_proposals=4, num_augmentations=2),
+)
 # As preset `paper` has it, and quick to compile: nothing local, Adam.
 _DRAWER = replace(
     _DOOR,
@@ -79,8 +117,8 @@ _DRAWER = replace(
         muon=False,
         networks=replace(
             _DOOR.perception.networks,
-            hand=(),
-            pointnet=replace(_DOOR.perception.networks.pointnet, around=(), context=()),
+            gripper_patch_hidden=(),
+            encoder=replace(_DOOR.perception.networks.encoder, local_groups=(), global_context=()),
         ),
     ),
 )
@@ -102,8 +140,8 @@ def tiny_run(banks: tuple[SceneBank, ViewBank], task: str, folder: Path) -> list
         bank.save(folder / f"{name}.npz")
     settings = _DOOR if task.endswith("door") else _DRAWER
     env = Data(folder).env("train", TASKS[task], "c", settings.env, settings.physics)
-    with Run(folder / "run", resolve(task, "quick", "c", 0, settings, folder)) as run:
-        Training(run, env, settings, 0, lambda *_: None).train()
+    with RunDir(folder / "run", resolve(task, "quick", "c", 0, settings, folder)) as run:
+        PipelineTrainer(run, env, settings, 0, lambda *_: None).train()
     rows = [_golden({k: v for k, v in row.items() if k != "seconds"}) for row in read_metrics(folder / "run")]
     return [{**row, "stage": RENAMED.get(row["stage"], row["stage"])} for row in rows]
 

@@ -9,22 +9,22 @@ import pytest
 from scipy.spatial import cKDTree
 
 from vatmart_jax.perception.pointnet2 import (
-    Around,
-    Level,
+    LocalGroup,
     PointNet2,
-    PointNetConfig,
+    PointNet2Config,
+    SetAbstraction,
     ball_query,
     farthest_points,
     group,
     three_nearest,
 )
 
-TINY = PointNetConfig(
+TINY = PointNet2Config(
     n_points=200,
-    levels=(Level(40, 0.3, 8, (16, 16)), Level(8, 0.8, 8, (16, 32))),
+    levels=(SetAbstraction(40, 0.3, 8, (16, 16)), SetAbstraction(8, 0.8, 8, (16, 32))),
     propagation=((16,), (32,)),
-    around=(Around(0.2, 8, (16,)),),
-    context=(8, 16),
+    local_groups=(LocalGroup(0.2, 8, (16,)),),
+    global_context=(8, 16),
 )
 
 
@@ -85,19 +85,19 @@ def test_grouping_of_a_batch_is_that_of_each_view_and_is_compact() -> None:
     alone = grouped(points[1], queries[1])
     for a, b in zip(jax.tree.leaves(batch), jax.tree.leaves(alone), strict=True):
         np.testing.assert_array_equal(a[1], b)
-    assert batch.neighbours[0].dtype == jnp.int16 and batch.weights[0].dtype == jnp.float16
-    wide = PointNetConfig(n_points=40_000, levels=(Level(4, 0.1, 4, (4,)),), propagation=((4,),))
+    assert batch.neighbors[0].dtype == jnp.int16 and batch.weights[0].dtype == jnp.float16
+    wide = PointNet2Config(n_points=40_000, levels=(SetAbstraction(4, 0.1, 4, (4,)),), propagation=((4,),))
     assert (
-        jax.eval_shape(lambda: group(jnp.zeros((40_000, 3)), jnp.zeros((1, 3)), wide)).neighbours[0].dtype == jnp.int32
+        jax.eval_shape(lambda: group(jnp.zeros((40_000, 3)), jnp.zeros((1, 3)), wide)).neighbors[0].dtype == jnp.int32
     )
 
 
 def test_features_of_chosen_queries_are_those_of_all() -> None:
     points, queries = jnp.asarray(cloud(1, 200)), jnp.asarray(cloud(2, 30))
-    grouping = grouped(points, queries)
-    params = initial(jax.random.key(0), points, grouping)
-    every = apply(params, points, grouping)
-    some = apply(params, points, grouping, jnp.array([3, 17, 3]))
+    point_groups = grouped(points, queries)
+    params = initial(jax.random.key(0), points, point_groups)
+    every = apply(params, points, point_groups)
+    some = apply(params, points, point_groups, jnp.array([3, 17, 3]))
     assert every.shape == (30, 128)
     np.testing.assert_allclose(some, every[jnp.array([3, 17, 3])], rtol=1e-5, atol=1e-6)
 
@@ -113,25 +113,25 @@ def test_queries_do_not_change_each_other() -> None:
 def test_what_lies_around_a_query_changes_its_feature_and_what_lies_far_off_does_not() -> None:
     points, queries = jnp.asarray(cloud(1, 200)), jnp.asarray(cloud(2, 30))
     near = jnp.argmin(((points - queries[0]) ** 2).sum(-1))
-    grouping = grouped(points, queries)
-    params = initial(jax.random.key(0), points, grouping)
-    alone = replace(grouping, around=tuple(jnp.full_like(a, near) for a in grouping.around))
+    point_groups = grouped(points, queries)
+    params = initial(jax.random.key(0), points, point_groups)
+    alone = replace(point_groups, local_groups=tuple(jnp.full_like(a, near) for a in point_groups.local_groups))
     lonely = apply(params, points, replace(alone, queries=queries + 10.0))
-    far = apply(params, points, replace(grouping, queries=queries + 10.0))
-    assert float(jnp.abs(apply(params, points, alone)[0] - apply(params, points, grouping)[0]).max()) > 1e-4
+    far = apply(params, points, replace(point_groups, queries=queries + 10.0))
+    assert float(jnp.abs(apply(params, points, alone)[0] - apply(params, points, point_groups)[0]).max()) > 1e-4
     np.testing.assert_array_equal(lonely, far)
 
 
 def test_every_parameter_has_a_gradient() -> None:
     points, queries = jnp.asarray(cloud(1, 200)), jnp.asarray(cloud(2, 30))
-    grouping = grouped(points, queries)
-    params = initial(jax.random.key(0), points, grouping)
-    gradients = jax.jit(jax.grad(lambda p: jnp.sum(apply(p, points, grouping) ** 2)))(params)
+    point_groups = grouped(points, queries)
+    params = initial(jax.random.key(0), points, point_groups)
+    gradients = jax.jit(jax.grad(lambda p: jnp.sum(apply(p, points, point_groups) ** 2)))(params)
     assert all(float(jnp.abs(g).max()) > 0 for g in jax.tree.leaves(gradients))
 
 
 def test_levels_and_propagations_must_match() -> None:
     with pytest.raises(ValueError, match="2 levels need as many propagations, not 1"):
-        PointNetConfig(levels=TINY.levels, propagation=((16,),))
+        PointNet2Config(levels=TINY.levels, propagation=((16,),))
     with pytest.raises(ValueError, match="a context needs two levels"):
-        PointNetConfig(levels=TINY.levels[:1], propagation=((16,),), context=(8,))
+        PointNet2Config(levels=TINY.levels[:1], propagation=((16,),), global_context=(8,))

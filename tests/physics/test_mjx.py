@@ -19,7 +19,7 @@ from test_physics import (  # noqa: F401  its tests hold for this module's `door
 from vatmart_jax.data.banks import HINGE, SceneBank
 from vatmart_jax.physics import PhysicsConfig, make_physics
 from vatmart_jax.physics.backend_c import CPhysics
-from vatmart_jax.physics.backend_mjx import MjxPhysics, Slots, _nearest
+from vatmart_jax.physics.backend_mjx import CollisionSlots, MjxPhysics, _nearest
 from vatmart_jax.physics.scene_model import PART
 
 
@@ -115,7 +115,7 @@ def test_each_box_gets_its_nearest_slots():
     quat = rng.normal(size=(n, 4))
     quat /= np.linalg.norm(quat, axis=1, keepdims=True)
     pos, half = rng.uniform(-1, 1, (n, 3)), np.full((n, 3), 0.02)
-    slots = Slots(*map(jnp.asarray, (pos, quat, half, np.arange(n), pos, half)))
+    slots = CollisionSlots(*map(jnp.asarray, (pos, quat, half, np.arange(n), pos, half)))
     boxes = rng.uniform(-1, 1, (2, 3))
     eyes = np.tile(np.eye(3), (2, 1, 1))
     found = _nearest(

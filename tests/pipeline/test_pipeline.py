@@ -15,35 +15,57 @@ from vatmart_jax.envs.env import TASKS, EnvConfig
 from vatmart_jax.errors import UserError
 from vatmart_jax.evaluation.success import downstream, random_method
 from vatmart_jax.perception.networks import NetworksConfig
-from vatmart_jax.perception.pointnet2 import Level, PointNetConfig
+from vatmart_jax.perception.pointnet2 import PointNet2Config, SetAbstraction
 from vatmart_jax.perception.trainer import PerceptionConfig
 from vatmart_jax.physics import PhysicsConfig
-from vatmart_jax.pipeline.exploration import ExploreConfig
+from vatmart_jax.pipeline.exploration import ExplorationConfig
 from vatmart_jax.pipeline.presets import PRESETS, EvaluationConfig, Schedule, Settings, default_preset
-from vatmart_jax.pipeline.run_dir import Run, RunError, read_metrics
-from vatmart_jax.pipeline.trainer import Training, perception_config
+from vatmart_jax.pipeline.run_dir import RunDir, RunError, read_metrics
+from vatmart_jax.pipeline.trainer import PipelineTrainer, perception_config
 from vatmart_jax.priors.priors import Priors
 from vatmart_jax.rl.td3 import TD3Config
 from vatmart_jax.workflows.evaluate import METRICS, evaluate
 from vatmart_jax.workflows.train import resolve, train
 
 TINY = Settings(
-    env=EnvConfig(batch=16),
+    env=EnvConfig(num_envs=16),
     physics=PhysicsConfig(steps_per_waypoint=50),
-    explore=ExploreConfig(td3=TD3Config(hidden=32, batch=32, capacity=1000, updates=4), iterations=4, pool=32),
+    explore=ExplorationConfig(
+        td3=TD3Config(hidden=32, batch_size=32, buffer_size=1000, grad_steps_per_iter=4),
+        iterations=4,
+        start_pool_size=32,
+    ),
     perception=PerceptionConfig(
         networks=NetworksConfig(
-            pointnet=PointNetConfig(64, (Level(16, 0.3, 4, (16,)), Level(4, 0.8, 4, (16,))), ((16,), (16,)), 16),
-            course=(16,), hinge=True,
+            encoder=PointNet2Config(
+                64, (SetAbstraction(16, 0.3, 4, (16,)), SetAbstraction(4, 0.8, 4, (16,))), ((16,), (16,)), 16
+            ),
+            flow_hidden=(16,),
+            predict_axis=True,
         ),
-        views=2, queries=4, probes=2, proposals=4, best=2, steps_per_call=3,
+        views_per_batch=2,
+        samples_per_view=4,
+        actionability_queries=2,
+        num_proposals=4,
+        top_k=2,
+        log_every=3,
     ),
     schedule=Schedule(
-        samples=512, collect=2, course=3, scorer=6, proposal=6, actionability=3, curiosity=2, curiosity_iterations=1,
-        curiosity_steps=3, finetune=1, finetune_batches=1, finetune_steps=3,
+        buffer_size=512,
+        collect_batches=2,
+        flow_steps=3,
+        scorer_steps=6,
+        proposal_steps=6,
+        actionability_steps=3,
+        curiosity_rounds=2,
+        curiosity_iterations=1,
+        curiosity_steps=3,
+        finetune_rounds=1,
+        finetune_batches=1,
+        finetune_steps=3,
     ),
-    evaluation=EvaluationConfig(trials=24, proposals=4, copies=2),
-)  # fmt: skip
+    evaluation=EvaluationConfig(trials=24, num_proposals=4, num_augmentations=2),
+)
 
 
 @pytest.fixture(scope="module")
@@ -77,7 +99,7 @@ def test_a_run_leaves_everything_its_readers_need(finished):
     assert all(seconds > 0 for seconds in result["stages"].values()) and {"compile", "evaluate"} < set(result["stages"])
     stages = [line["stage"] for line in read_metrics(out)]
     assert list(dict.fromkeys(stages)) == [
-        "explore", "collect", "course", "scorer", "proposal", "actionability", "curiosity", "finetune",
+        "explore", "collect", "flow", "scorer", "proposal", "actionability", "curiosity", "finetune",
     ]  # fmt: skip
 
 
@@ -85,9 +107,9 @@ def test_a_door_is_trained_with_its_hinge_from_data_to_priors(converted, tmp_pat
     result, _ = run(converted, tmp_path / "run", "push-door")
     assert set(result["success"]) == {"test_shapes", "test_categories"}
     for line in read_metrics(tmp_path / "run"):
-        assert ("hinge_loss" in line) == (line["stage"] in ("course", "scorer", "proposal", "curiosity", "finetune"))
+        assert ("axis_loss" in line) == (line["stage"] in ("flow", "scorer", "proposal", "curiosity", "finetune"))
         assert all(np.isfinite(value) for value in line.values() if not isinstance(value, str))
-    assert Priors.load(tmp_path / "run").config.networks.hinge
+    assert Priors.load(tmp_path / "run").config.networks.predict_axis
 
 
 def test_an_evaluation_has_the_priors_the_trials_the_policy_and_what_the_scores_were_worth(finished, tmp_path):
@@ -132,8 +154,8 @@ def test_failures_are_told_apart(converted, task):
 def test_a_run_keeps_the_running_mean_of_its_policy(finished, converted):
     out, _ = finished
     env = Data(converted).env("train", TASKS["push-drawer"], "c", TINY.env, TINY.physics)
-    with Run(out, resolve("push-drawer", "quick", "c", 0, TINY, converted)) as run:
-        td3 = Training(run, env, TINY, 0, lambda *_: None).train().explore.td3
+    with RunDir(out, resolve("push-drawer", "quick", "c", 0, TINY, converted)) as run:
+        td3 = PipelineTrainer(run, env, TINY, 0, lambda *_: None).train().explore.td3
     assert (out / "policy.msgpack").read_bytes() == serialization.to_bytes(jax.device_get(td3.target_policy))
     assert any(np.any(a != b) for a, b in zip(*map(jax.tree.leaves, (td3.policy, td3.target_policy)), strict=True))
 
@@ -174,17 +196,17 @@ def test_a_folder_with_something_else_is_refused(converted, tmp_path):
 
 def test_a_damaged_checkpoint_is_passed_over_and_all_damaged_is_an_error(tmp_path):
     state = {"x": np.arange(5.0), "key": jax.random.key(3)}
-    with Run(tmp_path / "run", {"a": 1}) as opened:
+    with RunDir(tmp_path / "run", {"a": 1}) as opened:
         opened.save(state)
         opened.save({**state, "x": 2 * state["x"]})
     folders = sorted((tmp_path / "run" / "checkpoints").iterdir(), key=lambda p: int(p.name))
     _damage(folders[-1])
-    with Run(tmp_path / "run", {"a": 1}) as opened:
+    with RunDir(tmp_path / "run", {"a": 1}) as opened:
         found = opened.restore(state)
         np.testing.assert_array_equal(found["x"], state["x"])
         assert jax.random.key_data(found["key"]).tolist() == jax.random.key_data(state["key"]).tolist()
     _damage(folders[0])
-    with Run(tmp_path / "run", {"a": 1}) as opened, pytest.raises(RunError, match="cannot be read"):
+    with RunDir(tmp_path / "run", {"a": 1}) as opened, pytest.raises(RunError, match="cannot be read"):
         opened.restore(state)
 
 
@@ -192,11 +214,14 @@ def test_a_damaged_checkpoint_is_passed_over_and_all_damaged_is_an_error(tmp_pat
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
 def test_a_checkpoint_of_another_version_is_an_error_and_stays(tmp_path):
     state = {"seconds": np.arange(8.0)}
-    with Run(tmp_path / "run", {"a": 1}) as opened:
+    with RunDir(tmp_path / "run", {"a": 1}) as opened:
         opened.save(state)
-    with Run(tmp_path / "run", {"a": 1}) as opened, pytest.raises(RunError, match="go on with the version that wrote"):
+    with (
+        RunDir(tmp_path / "run", {"a": 1}) as opened,
+        pytest.raises(RunError, match="go on with the version that wrote"),
+    ):
         opened.restore({"seconds": np.zeros(9)})
-    with Run(tmp_path / "run", {"a": 1}) as opened:
+    with RunDir(tmp_path / "run", {"a": 1}) as opened:
         np.testing.assert_array_equal(opened.restore({"seconds": np.zeros(8)})["seconds"], state["seconds"])
 
 
@@ -222,9 +247,9 @@ def test_unknown_names_are_refused_by_name():
 
 
 def test_a_number_of_copies_that_cannot_be_is_refused_before_anything_is_written(converted, tmp_path):
-    settings = replace(TINY, evaluation=EvaluationConfig(copies=0))
+    settings = replace(TINY, evaluation=EvaluationConfig(num_augmentations=0))
     config = resolve("push-drawer", "quick", "c", 0, settings, converted)
-    with pytest.raises(UserError, match="copies 0: expected 1 to 64"):
+    with pytest.raises(UserError, match="num_augmentations 0: expected 1 to 64"):
         train(config, settings, Data(converted), tmp_path / "run", lambda *_: None)
     assert not (tmp_path / "run").exists()
 
@@ -248,8 +273,8 @@ def test_the_bundled_objects_are_quick_and_own_ones_get_what_the_machine_can_do(
 def test_doors_have_a_hinge_where_the_settings_say_so_and_drawers_never():
     plain = replace(TINY, perception=replace(TINY.perception, networks=NetworksConfig()))
     for name, task in TASKS.items():
-        assert perception_config(TINY, task).networks.hinge == name.endswith("door")
-        assert not perception_config(plain, task).networks.hinge
+        assert perception_config(TINY, task).networks.predict_axis == name.endswith("door")
+        assert not perception_config(plain, task).networks.predict_axis
 
 
 @pytest.mark.parametrize("name", PRESETS)

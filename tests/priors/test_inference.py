@@ -13,16 +13,18 @@ from jax import export as jax_export
 from vatmart_jax.cli.main import main
 from vatmart_jax.errors import UserError
 from vatmart_jax.perception.networks import Networks, NetworksConfig
-from vatmart_jax.perception.pointnet2 import Level, PointNetConfig
+from vatmart_jax.perception.pointnet2 import PointNet2Config, SetAbstraction
 from vatmart_jax.priors.export import export
 from vatmart_jax.priors.priors import Priors, PriorsConfig, PriorsError, amount, read_cloud, read_mask
 
-TINY = PointNetConfig(n_points=64, levels=(Level(16, 0.3, 8, (16,)), Level(4, 0.8, 4, (16,))), propagation=((16,),) * 2)
+TINY = PointNet2Config(
+    n_points=64, levels=(SetAbstraction(16, 0.3, 8, (16,)), SetAbstraction(4, 0.8, 4, (16,))), propagation=((16,),) * 2
+)
 
 
 @pytest.fixture(scope="module")
 def priors() -> Priors:
-    config = PriorsConfig("push-drawer", 0.1, 0.7, NetworksConfig(pointnet=TINY))
+    config = PriorsConfig("push-drawer", 0.1, 0.7, NetworksConfig(encoder=TINY))
     return Priors(config, Networks(config.networks).init(jax.random.key(0)))
 
 
@@ -106,7 +108,7 @@ def damage(folder: Path, how: str) -> None:
     elif how == "unknown field":
         config.write_text(json.dumps(json.loads(config.read_text()) | {"colour": 1}))
     elif how == "too many copies":
-        config.write_text(json.dumps(json.loads(config.read_text()) | {"copies": 10**9}))
+        config.write_text(json.dumps(json.loads(config.read_text()) | {"num_augmentations": 10**9}))
     elif how == "other sizes":
         text = json.loads(config.read_text())
         text["networks"]["latent_dim"] = 7
@@ -131,7 +133,7 @@ def damage(folder: Path, how: str) -> None:
         ("config not JSON", "config.json: not a config of priors"),
         ("config of something else", "config.json: not a config of priors"),
         ("unknown field", "colour"),
-        ("too many copies", r"config.json: not a config of priors \(copies 1000000000: expected 1 to 64"),
+        ("too many copies", r"config.json: not a config of priors \(num_augmentations 1000000000: expected 1 to 64"),
         ("other sizes", r"params.msgpack: parameter \['decoder'\].*expected float32"),
         ("missing network", "parameter .*decoder.* is missing"),
         ("not finite", "parameter .*scorer.* is not finite"),

@@ -5,9 +5,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from vatmart_jax.config import from_json
 from vatmart_jax.errors import UserError
-from vatmart_jax.pipeline.presets import Settings
+from vatmart_jax.pipeline.run_config import settings_of
 from vatmart_jax.pipeline.run_dir import read_config
 from vatmart_jax.priors.pretrained import names, run_folder
 from vatmart_jax.priors.priors import Priors
@@ -17,7 +16,7 @@ from vatmart_jax.priors.priors import Priors
 def test_pretrained_priors_load_by_name_and_predict(name: str) -> None:
     folder = run_folder(Path(name))
     config = read_config(folder)
-    from_json(Settings, config["settings"])
+    settings_of(config)
     assert config["data"] is None
     assert sum(file.stat().st_size for file in folder.rglob("*")) < 20e6
     priors = Priors.load(folder)

@@ -9,12 +9,19 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from vatmart_jax.envs.env import reward_terms
-from vatmart_jax.rl.replay_buffer import Episode, Replay, Transition, hindsight
+from vatmart_jax.rl.replay_buffer import Episode, ReplayBuffer, Transition, hindsight
 from vatmart_jax.rl.td3 import TD3, TD3Config, TD3State
 
 OBSERVATION, ACTION = 4, 2
 CONFIG = TD3Config(
-    hidden=32, batch=128, learning_rate=3e-3, discount=0.5, polyak=0.05, reward_scale=0.1, capacity=4096, updates=500
+    hidden=32,
+    batch_size=128,
+    learning_rate=3e-3,
+    discount=0.5,
+    tau=0.05,
+    reward_scale=0.1,
+    buffer_size=4096,
+    grad_steps_per_iter=500,
 )
 
 
@@ -38,16 +45,18 @@ def best_action(obs):
 
 
 @pytest.fixture(scope="module")
-def replay() -> Replay:
+def replay() -> ReplayBuffer:
     """Two-step trials: in the first step (obs[3] = 0) actions do nothing; the second pays for the best action."""
     k1, k2 = jax.random.split(jax.random.key(0))
-    obs = jax.random.uniform(k1, (CONFIG.capacity, OBSERVATION), minval=-1.0)
-    obs = obs.at[:, 3].set(jnp.arange(CONFIG.capacity) % 2)
+    obs = jax.random.uniform(k1, (CONFIG.buffer_size, OBSERVATION), minval=-1.0)
+    obs = obs.at[:, 3].set(jnp.arange(CONFIG.buffer_size) % 2)
     last = obs[:, 3]
-    action = jax.random.uniform(k2, (CONFIG.capacity, ACTION), minval=-1.0)
+    action = jax.random.uniform(k2, (CONFIG.buffer_size, ACTION), minval=-1.0)
     reward = last * (10 - 20 * jnp.sum((action - best_action(obs)) ** 2, -1))
     steps = Transition(obs, action, reward, obs.at[:, 3].set(1), last)
-    return Replay.create(CONFIG.capacity, OBSERVATION, ACTION).insert(steps, jnp.ones(CONFIG.capacity, bool))
+    return ReplayBuffer.create(CONFIG.buffer_size, OBSERVATION, ACTION).insert(
+        steps, jnp.ones(CONFIG.buffer_size, bool)
+    )
 
 
 @pytest.fixture(scope="module")
@@ -78,7 +87,7 @@ def saturated(state: TD3State) -> TD3State:
 
 def test_a_saturated_policy_finds_its_way_back_and_without_the_penalty_does_not(td3, learn, fresh, replay):
     last = jax.random.uniform(jax.random.key(3), (500, OBSERVATION), minval=-0.9, maxval=0.9).at[:, 3].set(1)
-    stuck = jax.jit(TD3(replace(CONFIG, saturation=0.0), OBSERVATION, ACTION).learn)
+    stuck = jax.jit(TD3(replace(CONFIG, pre_tanh_l2=0.0), OBSERVATION, ACTION).learn)
     error = {}
     for name, step in (("with", learn), ("without", stuck)):
         state = saturated(fresh)
@@ -103,10 +112,10 @@ def test_critics_differ_and_targets_follow_slowly(td3, fresh, replay):
     first, second = (jax.tree.map(lambda x, k=k: x[k], state.critics) for k in (0, 1))
     kernels = [critic["params"]["Dense_0"]["kernel"] for critic in (first, second)]
     assert (kernels[0] != kernels[1]).all()
-    steps = replay.sample(jax.random.key(0), CONFIG.batch)
+    steps = replay.sample(jax.random.key(0), CONFIG.batch_size)
     update = jax.jit(td3._update)
     once, _ = update(state, steps, jax.random.key(0))
-    same = lambda a, b: all((x == y).all() for x, y in zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True))  # noqa: E731
+    same = lambda a, b: all((x == y).all() for x, y in zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True))
     assert same(once.policy, state.policy) and same(once.target_critics, state.target_critics)
     assert not same(once.critics, state.critics)
     twice, _ = update(once, steps, jax.random.key(1))
@@ -116,7 +125,7 @@ def test_critics_differ_and_targets_follow_slowly(td3, fresh, replay):
         (twice.target_critics, state.critics, twice.critics),
     ):
         for t, o, n in zip(*map(jax.tree.leaves, (target, old, new)), strict=True):
-            np.testing.assert_allclose(t, (1 - CONFIG.polyak) * o + CONFIG.polyak * n, atol=1e-6)
+            np.testing.assert_allclose(t, (1 - CONFIG.tau) * o + CONFIG.tau * n, atol=1e-6)
 
 
 def test_exploration_noise_is_bounded_and_its_random_share_uniform(td3, fresh):
@@ -133,7 +142,7 @@ def test_exploration_noise_is_bounded_and_its_random_share_uniform(td3, fresh):
 
 
 N, CAPACITY = 6, 8
-insert = jax.jit(Replay.insert)
+insert = jax.jit(ReplayBuffer.insert)
 
 
 def numbered(first: int, n: int) -> Transition:
@@ -144,7 +153,7 @@ def numbered(first: int, n: int) -> Transition:
 @settings(deadline=None, max_examples=50)
 @given(st.lists(st.lists(st.booleans(), min_size=N, max_size=N), max_size=6))
 def test_the_ring_holds_the_last_kept_steps_as_a_list_would(keeps):
-    ring, oracle = Replay.create(CAPACITY, 3, 1), deque(maxlen=CAPACITY)
+    ring, oracle = ReplayBuffer.create(CAPACITY, 3, 1), deque(maxlen=CAPACITY)
     for k, keep in enumerate(keeps):
         ring = insert(ring, numbered(1 + N * k, N), jnp.array(keep))
         oracle.extend(1 + N * k + i for i in range(N) if keep[i])
@@ -160,12 +169,12 @@ def test_the_ring_holds_the_last_kept_steps_as_a_list_would(keeps):
 
 def test_an_insert_larger_than_the_ring_keeps_its_last_steps():
     keep = np.arange(30) % 3 != 0
-    ring = Replay.create(CAPACITY, 3, 1).insert(numbered(0, 30), jnp.array(keep))
+    ring = ReplayBuffer.create(CAPACITY, 3, 1).insert(numbered(0, 30), jnp.array(keep))
     assert sorted(np.asarray(ring.data.reward).tolist()) == np.flatnonzero(keep)[-CAPACITY:].tolist()
 
 
 def test_samples_are_uniform_over_what_was_inserted():
-    ring = insert(Replay.create(CAPACITY, 3, 1), numbered(1, N), jnp.array([True, True, False, True, True, True]))
+    ring = insert(ReplayBuffer.create(CAPACITY, 3, 1), numbered(1, N), jnp.array([True, True, False, True, True, True]))
     values, counts = np.unique(ring.sample(jax.random.key(0), 5000).reward, return_counts=True)
     assert values.tolist() == [1, 2, 4, 5, 6]
     assert (np.abs(counts / 5000 - 0.2) < 0.03).all()
@@ -191,7 +200,7 @@ def episode() -> Episode:
         o[..., 0], o[..., 1], o[..., 2] = moved, task, task - moved
     distance = rng.uniform(0, 0.2, (K, B))
     done = np.arange(K)[:, None] >= length - 1
-    as_f32 = lambda x: jnp.asarray(x, jnp.float32)  # noqa: E731
+    as_f32 = lambda x: jnp.asarray(x, jnp.float32)
     return Episode(
         as_f32(obs[0]), as_f32(rng.uniform(-1, 1, (K, B, 2))), as_f32(rng.normal(size=(K, B))), as_f32(obs[1]),
         jnp.asarray(done), jnp.asarray(active), as_f32(before), as_f32(after), as_f32(distance), jnp.asarray(held),
@@ -219,7 +228,7 @@ def test_hindsight_tasks_are_what_this_or_a_later_step_achieved(episode, relabel
         assert len(steps)
         later.add(int(steps[0]))
         assert GOALS[0] <= goal <= GOALS[1] and goal > episode.before[k, b]
-        assert active[k, b] and episode.held[k, b]
+        assert active[k, b] and episode.grasp_held[k, b]
     assert later == {0, 1, 2, 3}
 
 
@@ -242,7 +251,7 @@ def test_hindsight_rewards_and_ends_are_those_of_the_new_task(episode, relabelle
         copies.obs[..., 1],
         *map(np.asarray, (episode.before, episode.after, episode.distance)),
     )
-    held = np.asarray(episode.held)
+    held = np.asarray(episode.grasp_held)
     success = (np.abs(goal - after) <= TOLERANCE * goal) & held
     expected = (
         300 * (np.abs(goal - before) - np.abs(goal - after))

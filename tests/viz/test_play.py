@@ -46,11 +46,11 @@ def test_scenes_are_named_by_object_by_part_and_by_index(cabinets):
 def test_a_recording_ends_where_the_environment_does(data, trajectory):
     recording, result = play(data, "200:drawer", trajectory=trajectory)
     bank, views = SceneBank.load(data / "scenes.npz"), ViewBank.load(data / "views.npz")
-    env = Env(bank.select([3]), views.of_scenes([3]), TASKS["push-drawer"], config=EnvConfig(batch=1))
+    env = Env(bank.select([3]), views.of_scenes([3]), TASKS["push-drawer"], config=EnvConfig(num_envs=1))
     start = recording.state.start
     end = jax.jit(env.execute)(start, unpack_trajectory(np.load(trajectory)[None])[1])
     np.testing.assert_allclose(recording.qpos[-1], end.physics.qpos[0], atol=1e-4)
-    assert result["moved"] == pytest.approx(float(end.moved[0]), abs=1e-3) and result["moved"] > 0.02
+    assert result["moved"] == pytest.approx(float(end.displacement[0]), abs=1e-3) and result["moved"] > 0.02
     assert len(recording.qpos) == result["frames"] == 81
     steps = np.abs(np.diff(recording.qpos, axis=0)).max(1)
     assert 0 < steps.max() < 0.1  # no frame is missing

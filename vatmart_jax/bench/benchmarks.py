@@ -23,11 +23,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from vatmart_jax.data.banks import SceneBank, ViewBank
-from vatmart_jax.envs.env import TASKS, Env, EnvConfig, EnvState, Start
-from vatmart_jax.envs.scripted_policy import expert_action
-from vatmart_jax.errors import UserError, one_of
+from vatmart_jax.envs.env import TASKS, Env, EnvConfig, EnvState, TrialStart
+from vatmart_jax.envs.scripted_policy import scripted_action
+from vatmart_jax.errors import UserError, require_one_of
 from vatmart_jax.perception import trainer as perception
-from vatmart_jax.perception.grouped_views import clouds_of
+from vatmart_jax.perception.grouped_views import group_views
 from vatmart_jax.perception.networks import Networks
 from vatmart_jax.perception.pointnet2 import group
 from vatmart_jax.physics.controller import hand_target, waypoint_controls
@@ -70,8 +70,8 @@ def bench_physics(
     Each measurement lasts at least `seconds`. Of several batch sizes each runs in a process of its own, for peaks of
     memory would add up; the result is the first one's, and all are its `runs`.
     """
-    one_of("--task", task, TASKS)
-    one_of("--impl", impl, IMPLS)
+    require_one_of("--task", task, TASKS)
+    require_one_of("--impl", impl, IMPLS)
     if min(batches) < 1:
         raise UserError(f"--batch {min(batches)}: a batch has one simulation or more")
     if len(batches) == 1:
@@ -85,12 +85,12 @@ def bench_physics(
 
 def _physics(choice: Choice, impl: str, batch: int, task: str, seed: int, seconds: float) -> dict[str, Any]:
     begun = time.perf_counter()
-    env = Env(*choice.banks(seed), TASKS[task], impl, EnvConfig(batch=batch))
+    env = Env(*choice.banks(seed), TASKS[task], impl, EnvConfig(num_envs=batch))
     build_seconds = time.perf_counter() - begun
     key, k_start, k_noise = jax.random.split(jax.random.key(seed), 3)
     start = start_pool(env, k_start, batch)
     press = jax.jit(partial(_press, env))
-    touching = press(jax.jit(env.begin)(start), jnp.array(APPROACH))
+    touching = press(jax.jit(env.begin_trials)(start), jnp.array(APPROACH))
     pressing = _timed(lambda _: press(touching, jnp.array(ADVANCES)), seconds)
 
     residuals = jax.jit(partial(random_trials, env))(start, k_noise).residuals
@@ -136,7 +136,7 @@ def bench_parity(
     With a twin, another conversion of the same objects (boxes for hulls), the first implementation runs on that too.
     """
     for impl in impls:
-        one_of("--impls", impl, IMPLS)
+        require_one_of("--impls", impl, IMPLS)
     bank, views = choice.banks(seed)
     variants = {impl: (impl, bank) for impl in impls}
     if twin is not None:
@@ -193,43 +193,43 @@ def bench_parity(
 
 def bench_perception(choice: Choice, preset: str, seed: int, seconds: float) -> dict[str, Any]:
     """Training steps per second of each stage, and how long one view of 10,000 points takes to group and to encode."""
-    one_of("--preset", preset, PRESETS)
-    config = replace(PRESETS[preset].perception, steps_per_call=5)
-    networks, pointnet = Networks(config.networks), config.networks.pointnet
+    require_one_of("--preset", preset, PRESETS)
+    config = replace(PRESETS[preset].perception, log_every=5)
+    networks, encoder = Networks(config.networks), config.networks.encoder
     rng = np.random.default_rng(seed)
     _, views = choice.banks(seed)
     views = views.select(rng.permutation(len(views))[: 2 * config.views])
-    views = replace(views, points=_with_points(rng, views.points, max(10_000, pointnet.n_points)))
+    views = replace(views, points=_with_points(rng, views.points, max(10_000, encoder.n_points)))
     upright = jnp.broadcast_to(jnp.array([0.0, 0.0, 1.0]), (len(views), 3))
-    clouds = clouds_of(views, pointnet).replace(joints=(upright, jnp.zeros((len(views), 3))))
+    grouped_views = group_views(views, encoder).replace(joints=(upright, jnp.zeros((len(views), 3))))
     rows = 4 * config.views * config.queries
-    samples = perception.Samples(
+    samples = perception.Interactions(
         view=jnp.asarray(rng.integers(0, len(views), rows), jnp.int32),
         contact=jnp.asarray(rng.integers(0, views.contacts.shape[1], rows), jnp.int32),
-        task=jnp.asarray(rng.uniform(config.low, config.high, rows), jnp.float32),
+        goal=jnp.asarray(rng.uniform(config.low, config.high, rows), jnp.float32),
         trajectory=jnp.asarray(rng.normal(size=(rows, TRAJECTORY)), jnp.float32),
-        moved=jnp.asarray(rng.uniform(config.low, config.high, rows), jnp.float32),
+        displacement=jnp.asarray(rng.uniform(config.low, config.high, rows), jnp.float32),
         valid=jnp.ones(rows, bool),
-        proposed=jnp.zeros(rows, bool),
+        from_proposal=jnp.zeros(rows, bool),
     )
     state = perception.begin(jax.random.key(seed), config)
-    steps = partial(perception.train, state, clouds, samples, config, steps=config.steps_per_call)
-    trained = [stage for stage in perception.STAGES if stage != "course" or config.networks.course]
+    steps = partial(perception.train, state, grouped_views, samples, config, steps=config.log_every)
+    trained = [stage for stage in perception.STAGES if stage != "flow" or config.networks.flow_hidden]
     stages = {stage: _timed(lambda _, stage=stage: steps(stage=stage), seconds) for stage in trained}
 
     points, queries = (jnp.asarray(x[0], jnp.float32) for x in (views.points[:, :10_000], views.contacts))
-    grouping = _timed(lambda _: _group(points, queries, pointnet), seconds)
+    point_groups = _timed(lambda _: _group(points, queries, encoder), seconds)
     encode = jax.jit(networks.features)
-    encoding = _timed(lambda _: encode(state.params, points, grouping.result), seconds)
+    encoding = _timed(lambda _: encode(state.params, points, point_groups.result), seconds)
     return {
         "preset": preset,
-        "training_points": pointnet.n_points,
+        "training_points": encoder.n_points,
         "views_per_step": config.views,
         "samples_per_step": config.views * config.queries,
         "parameters": sum(x.size for x in jax.tree.leaves(state.params)),
-        "steps_per_second": {name: round(config.steps_per_call / t.seconds, 3) for name, t in stages.items()},
+        "steps_per_second": {name: round(config.log_every / t.seconds, 3) for name, t in stages.items()},
         "encode_points": len(points),
-        "group_seconds": round(grouping.seconds, 4),
+        "group_seconds": round(point_groups.seconds, 4),
         "encode_seconds": round(encoding.seconds, 4),
         "compile_seconds": {name: round(t.compile_seconds, 1) for name, t in stages.items()},
         "peak_memory_mb": round(_peak_memory() / 2**20),
@@ -239,14 +239,14 @@ def bench_perception(choice: Choice, preset: str, seed: int, seconds: float) -> 
     }
 
 
-def random_trials(env: Env, start: Start, key: jax.Array) -> EnvState:
+def random_trials(env: Env, start: TrialStart, key: jax.Array) -> EnvState:
     """Trials of the scripted expert with noise on its actions. Consumes the key."""
 
     def step(state: EnvState, key: jax.Array) -> tuple[EnvState, None]:
-        action = expert_action(env, state)
-        return env.step(state, action + NOISE * jax.random.normal(key, action.shape), abandon=False), None
+        action = scripted_action(env, state)
+        return env.step(state, action + NOISE * jax.random.normal(key, action.shape), terminate_on_failure=False), None
 
-    return jax.lax.scan(step, env.begin(start), jax.random.split(key, WAYPOINTS))[0]
+    return jax.lax.scan(step, env.begin_trials(start), jax.random.split(key, WAYPOINTS))[0]
 
 
 def device() -> str:
@@ -292,7 +292,12 @@ def _press(env: Env, state: EnvState, advances: jax.Array) -> EnvState:
 
 
 def _outcome(final: EnvState) -> dict[str, np.ndarray]:
-    return {"moved": final.moved, "success": final.success, "valid": final.valid, "diverged": final.physics.diverged}  # pyright: ignore[reportReturnType]
+    return {
+        "moved": final.displacement,
+        "success": final.success,
+        "valid": final.valid,
+        "diverged": final.physics.diverged,
+    }  # pyright: ignore[reportReturnType]
 
 
 def _agreement(a: dict[str, np.ndarray], b: dict[str, np.ndarray]) -> dict[str, float]:

@@ -15,8 +15,8 @@ import tyro
 from tyro.conf import Positional, arg
 
 from vatmart_jax import __version__
-from vatmart_jax.atomic_io import whole_folder, write_json
-from vatmart_jax.errors import OpenGLError, UserError, one_of
+from vatmart_jax.atomic_io import atomic_directory, write_json
+from vatmart_jax.errors import OpenGLError, UserError, require_one_of
 
 _Json = Annotated[bool, arg(help="print one JSON object as the last line of standard output")]
 
@@ -116,7 +116,7 @@ def _train(argv: list[str]) -> None:
     from vatmart_jax.pipeline.presets import PRESETS, Settings, default_preset
 
     chosen = _peek(argv, "--preset") or default_preset(_peek(argv, "--data") is not None)
-    one_of("--preset", chosen, PRESETS)
+    require_one_of("--preset", chosen, PRESETS)
 
     @dataclass(frozen=True)
     class Train:
@@ -147,7 +147,7 @@ def _train(argv: list[str]) -> None:
     from vatmart_jax.data.dataset import Data
     from vatmart_jax.physics.types import default_impl
     from vatmart_jax.pipeline.run_dir import check_folder
-    from vatmart_jax.reporting import Bars
+    from vatmart_jax.reporting import ConsoleReporter
     from vatmart_jax.workflows.train import resolve, train
 
     if args.more_data and args.data is None:
@@ -156,10 +156,10 @@ def _train(argv: list[str]) -> None:
         args.task, args.preset, args.impl or default_impl(), args.seed, args.settings, args.data, args.more_data
     )
     check_folder(args.out, config)
-    with Bars() as bars:
-        points = args.settings.perception.networks.pointnet.n_points
-        data = Data(*(_prepared(folder, bars.say, points) for folder in (args.data, *args.more_data)))
-        result, table = train(config, args.settings, data, args.out, bars)
+    with ConsoleReporter() as reporter:
+        points = args.settings.perception.networks.encoder.n_points
+        data = Data(*(_prepared(folder, reporter.info, points) for folder in (args.data, *args.more_data)))
+        result, table = train(config, args.settings, data, args.out, reporter)
     _print_result(result, args.json, table)
 
 
@@ -192,13 +192,13 @@ def _evaluate(argv: list[str]) -> None:
         raise UserError("no run; give one or more run folders of `vatmart train`")
     _enable_compilation_cache()
     from vatmart_jax.physics.types import default_impl
-    from vatmart_jax.reporting import Bars
+    from vatmart_jax.reporting import ConsoleReporter
     from vatmart_jax.workflows.evaluate import evaluate
 
-    with Bars() as bars:
+    with ConsoleReporter() as reporter:
         result, table = evaluate(
             args.run,
-            lambda data: _prepared(data, bars.say),
+            lambda data: _prepared(data, reporter.info),
             args.data,
             tuple(args.metrics.split(",")),
             tuple(args.methods.split(",")),
@@ -206,7 +206,7 @@ def _evaluate(argv: list[str]) -> None:
             args.impl or default_impl(),
             args.seed,
             args.out,
-            bars,
+            reporter,
         )
     _print_result(result, args.json, table)
 
@@ -251,13 +251,13 @@ def _play(argv: list[str]) -> None:
     _enable_compilation_cache()
     from vatmart_jax.pipeline.run_dir import read_config
     from vatmart_jax.priors.pretrained import run_folder
-    from vatmart_jax.reporting import Bars
+    from vatmart_jax.reporting import ConsoleReporter
     from vatmart_jax.viz.trial_video import animate, play, show
 
     run = run_folder(args.run) if args.run else None
     of_run = read_config(run)["data"] if run else None
-    with Bars() as bars:
-        folder = _prepared(args.data or (Path(of_run) if of_run else None), bars.say)
+    with ConsoleReporter() as reporter:
+        folder = _prepared(args.data or (Path(of_run) if of_run else None), reporter.info)
     recording, result = play(folder, args.scene, args.task, args.amount, args.trajectory, args.contact, run, args.seed)
     if args.viewer:
         show(recording)
@@ -280,13 +280,13 @@ def _bench(argv: list[str]) -> None:
     args = tyro.cli(_BENCHES[what], args=argv[1:], prog=f"vatmart bench {what}")
     _enable_compilation_cache()
     from vatmart_jax.bench.benchmarks import Choice
-    from vatmart_jax.reporting import Bars
+    from vatmart_jax.reporting import ConsoleReporter
 
     if len(args.data) > (2 if what == "parity" else 1):
         raise UserError(f"--data: {len(args.data)} folders; give one (parity: or two conversions of the same objects)")
-    with Bars() as bars:
-        folders = [_prepared(data, bars.say) for data in args.data or (None,)]
-        result = args.run(Choice(folders[0], args.split, args.objects), folders[1:], bars.say)
+    with ConsoleReporter() as reporter:
+        folders = [_prepared(data, reporter.info) for data in args.data or (None,)]
+        result = args.run(Choice(folders[0], args.split, args.objects), folders[1:], reporter.info)
     if args.out:
         write_json(args.out, result)
     _print_result(result, args.json)
@@ -473,7 +473,7 @@ def _prepared(data: Path | None, say: Callable[[str], None], points: int = 0) ->
     def make(out: Path) -> None:
         if not out.is_dir():
             say(f"making {BUNDLED_COUNT} bundled objects")
-            with whole_folder(out) as part:
+            with atomic_directory(out) as part:
                 generate(part, BUNDLED_COUNT, BUNDLED_SEED)
 
     return prepare(data, convert_into, make, say)

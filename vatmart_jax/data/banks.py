@@ -22,7 +22,7 @@ import jax.numpy as jnp
 import numpy as np
 from flax import struct
 
-from vatmart_jax.atomic_io import whole
+from vatmart_jax.atomic_io import atomic_write
 from vatmart_jax.errors import UserError
 
 HINGE, SLIDE = 0, 1
@@ -105,7 +105,7 @@ class SceneBank:
         """One bank of the Scenes of several, in their order. Raises ValueError where collision geometry differs."""
         if len(kinds := {bank.collision for bank in banks}) > 1:
             raise ValueError(f"their collision geometry differs ({', '.join(sorted(kinds))})")
-        table = lambda name: np.concatenate([getattr(bank, name) for bank in banks])  # noqa: E731
+        table = lambda name: np.concatenate([getattr(bank, name) for bank in banks])
         out: dict[str, Any] = {name: table(name) for name in (*_PER_SCENE, "hull_vertices", "box_size")}
         out["hull_start"] = _starts(bank.hull_start for bank in banks)
         statics, parts = (_starts(getattr(bank, name) for bank in banks) for name in ("static_start", "part_start"))
@@ -211,7 +211,7 @@ class Scenes:
         w, v = bank.part_quat[:, :1], bank.part_quat[:, 1:]
         t = 2 * np.cross(v, bank.axis)
         axis = bank.axis + w * t + np.cross(v, t)
-        as_f32 = lambda a: jnp.asarray(a, jnp.float32)  # noqa: E731
+        as_f32 = lambda a: jnp.asarray(a, jnp.float32)
         return cls(
             jnp.asarray(category, jnp.int32), as_f32(bank.part_pos), as_f32(axis), as_f32(bank.width), len(names)
         )
@@ -223,7 +223,7 @@ def _starts(starts: Iterable[np.ndarray]) -> np.ndarray:
 
 
 def _save(path: Path | str, kind: str, arrays: dict[str, np.ndarray | str]) -> None:
-    with whole(path) as part, part.open("wb") as f:
+    with atomic_write(path) as part, part.open("wb") as f:
         np.savez(f, **{"format": np.int32(FORMAT), "kind": np.array(kind), **arrays})  # pyright: ignore[reportArgumentType]
 
 

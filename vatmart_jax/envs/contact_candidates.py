@@ -12,7 +12,7 @@ from vatmart_jax.data.banks import HINGE, SLIDE, SceneBank, Scenes, ViewBank
 _HANDLE_POINTS, _HAND_REACH = 200, 0.05  # per shape of a handle; unit lengths about the contact
 
 
-def promising_contacts(bank: SceneBank, views: ViewBank, opening: bool) -> np.ndarray:
+def candidate_contacts(bank: SceneBank, views: ViewBank, opening: bool) -> np.ndarray:
     """[V, C] bool: where the task may be done.
 
     Push: faces that look against the part's motion, off its axis. Pull: handles, and faces along the motion and off the
@@ -25,7 +25,7 @@ def promising_contacts(bank: SceneBank, views: ViewBank, opening: bool) -> np.nd
     return views.contact_handle | ((np.abs(along) < 0.4) & (arm > 0.1))
 
 
-def grasps(bank: SceneBank, views: ViewBank) -> tuple[np.ndarray, np.ndarray]:
+def canonical_grasps(bank: SceneBank, views: ViewBank) -> tuple[np.ndarray, np.ndarray]:
     """The straight grasp at every contact: approach direction [V, C, 3] and the axis along which the fingers close
     [V, C, 3], float32 unit, object frame.
 

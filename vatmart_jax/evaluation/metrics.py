@@ -33,7 +33,7 @@ def scorer_metrics(scores: np.ndarray, labels: np.ndarray, threshold: float = 0.
     scores: [n] probabilities; labels: [n], true or 1 where positive. A ratio without anything below the line is 0.
     """
     said, true = np.asarray(scores) > threshold, np.asarray(labels).astype(bool)
-    ratio = lambda a, b: float(a / b) if b else 0.0  # noqa: E731
+    ratio = lambda a, b: float(a / b) if b else 0.0
     hits = np.sum(said & true)
     precision, recall = ratio(hits, said.sum()), ratio(hits, true.sum())
     rejected = ratio(np.sum(~said & ~true), np.sum(~true))

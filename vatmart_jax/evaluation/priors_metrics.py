@@ -9,17 +9,17 @@ import jax.numpy as jnp
 import numpy as np
 
 from vatmart_jax.evaluation import metrics as m
-from vatmart_jax.perception.grouped_views import Clouds
+from vatmart_jax.perception.grouped_views import GroupedViews
 from vatmart_jax.perception.networks import Params
-from vatmart_jax.perception.predictor import Ensemble, propose_trajectories, score_trajectories
-from vatmart_jax.perception.trainer import Samples
-from vatmart_jax.pipeline.exploration import Explorer
-from vatmart_jax.pipeline.proposal_rollouts import samples_of
+from vatmart_jax.perception.predictor import TTAPredictor, propose_trajectories, score_trajectories
+from vatmart_jax.perception.trainer import Interactions
+from vatmart_jax.pipeline.exploration import ExplorationLoop
+from vatmart_jax.pipeline.proposal_rollouts import interactions_of
 
 _NOISE = 0.05  # of the policy, share of the action range: varied trajectories, most of them good
 
 
-def labelled(explorer: Explorer, policy: Any, count: int, key: jax.Array) -> tuple[Samples, Samples]:
+def labelled(explorer: ExplorationLoop, policy: Any, count: int, key: jax.Array) -> tuple[Interactions, Interactions]:
     """`count` positives and as many negatives of the policy, from random starts (paper, section 5.1).
 
     A positive is a trajectory that did its task. Negatives are, half and half where there are enough, positives whose
@@ -27,12 +27,14 @@ def labelled(explorer: Explorer, policy: Any, count: int, key: jax.Array) -> tup
     key. Fewer come back where the policy has too few successes in 40 batches.
     """
     tolerance, task = explorer.env.config.tolerance, explorer.env.task
-    good: list[Samples] = []
-    bad: list[Samples] = []
+    good: list[Interactions] = []
+    bad: list[Interactions] = []
     found = 0
     for batch in range(40):
-        final, _ = explorer.run(policy, None, jax.random.fold_in(key, batch), _NOISE, 0.0, abandon=False)
-        samples = jax.device_get(samples_of(final))
+        final, _ = explorer.rollout(
+            policy, None, jax.random.fold_in(key, batch), _NOISE, 0.0, terminate_on_failure=False
+        )
+        samples = jax.device_get(interactions_of(final))
         success = np.asarray(samples.success(tolerance))
         good.append(jax.tree.map(lambda a: a[success], samples))  # noqa: B023
         bad.append(jax.tree.map(lambda a: a[~success], samples))  # noqa: B023
@@ -43,7 +45,7 @@ def labelled(explorer: Explorer, policy: Any, count: int, key: jax.Array) -> tup
     n = len(positive.view)
     rng = np.random.default_rng(np.asarray(jax.random.key_data(key)))
     off = np.exp(rng.choice([-1, 1], n) * rng.uniform(0.2, 1.0, n))  # a fifth to e times off, either way
-    shifted = positive.replace(task=np.clip(positive.moved * off, 0.5 * task.low, 1.5 * task.high))
+    shifted = positive.replace(goal=np.clip(positive.displacement * off, 0.5 * task.low, 1.5 * task.high))
     wrong = ~np.asarray(shifted.success(tolerance))
     shifted = jax.tree.map(lambda a: a[wrong], shifted)
     half = min(n // 2, len(failed.view))
@@ -52,11 +54,11 @@ def labelled(explorer: Explorer, policy: Any, count: int, key: jax.Array) -> tup
 
 
 def priors_metrics(
-    ensemble: Ensemble,
+    predictor: TTAPredictor,
     params: Params,
-    clouds: Clouds,
-    positive: Samples,
-    negative: Samples,
+    grouped_views: GroupedViews,
+    positive: Interactions,
+    negative: Interactions,
     key: jax.Array,
     runs: int = 10,
     proposals: int = 100,
@@ -65,8 +67,8 @@ def priors_metrics(
 
     Coverage is the mean of `runs` draws of `proposals` trajectories per positive. Consumes the key.
     """
-    score = lambda s: np.asarray(  # noqa: E731
-        score_trajectories(ensemble, params, clouds, s.view, s.contact, s.task, s.trajectory)
+    score = lambda s: np.asarray(
+        score_trajectories(predictor, params, grouped_views, s.view, s.contact, s.goal, s.trajectory)
     )
     p, n = score(positive), score(negative)
     labels = np.concatenate([np.ones(len(p)), np.zeros(len(n))])
@@ -75,7 +77,7 @@ def priors_metrics(
     covered = []
     for run in range(runs):
         proposed, _ = propose_trajectories(
-            ensemble, params, clouds, positive.view, positive.contact, positive.task,
+            predictor, params, grouped_views, positive.view, positive.contact, positive.goal,
             jax.random.fold_in(key, run), proposals,
         )  # fmt: skip
         covered.append(m.coverage(np.asarray(proposed), np.asarray(positive.trajectory)))

@@ -14,24 +14,24 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from vatmart_jax.envs.env import Env, EnvState, Start
+from vatmart_jax.envs.env import Env, EnvState, TrialStart
 from vatmart_jax.evaluation.metrics import reliability, wilson_interval
 from vatmart_jax.trajectory import WAYPOINTS
 
-Method = Callable[[Start, jax.Array], tuple[EnvState, jax.Array | None]]
+Method = Callable[[TrialStart, jax.Array], tuple[EnvState, jax.Array | None]]
 """Final states for views and tasks (contact and rotation may be replaced) and a key, and what it thought of its chances
 [B], if it says."""
 
 
 def random_method(env: Env) -> Method:
     """Random contact on the part, random approach within the cone, residuals uniform in the action range."""
-    limits = jnp.array([env.config.move_range] * 3 + [env.config.turn_range] * 3)
+    limits = jnp.array([env.config.max_translation] * 3 + [env.config.max_rotation] * 3)
 
     @jax.jit
-    def run(start: Start, key: jax.Array) -> tuple[EnvState, None]:
+    def run(start: TrialStart, key: jax.Array) -> tuple[EnvState, None]:
         k_start, k_move = jax.random.split(key)
         residuals = jax.random.uniform(k_move, (len(start.view), WAYPOINTS, 6), minval=-1.0) * limits
-        return env.execute(env.approach(k_start, start.view, start.task, 0.0), residuals), None
+        return env.execute(env.sample_approach(k_start, start.view, start.goal, 0.0), residuals), None
 
     return run
 
@@ -46,24 +46,24 @@ def downstream(
 
     Consumes the key.
     """
-    sample = jax.jit(lambda key: env.sample(key, env.config.batch))
+    sample = jax.jit(lambda key: env.sample(key, env.config.num_envs))
     rows: list[dict[str, np.ndarray]] = []
-    for batch in range(-(-trials // env.config.batch)):
+    for batch in range(-(-trials // env.config.num_envs)):
         ks, km = jax.random.split(jax.random.fold_in(key, batch))
         final, score = method(sample(ks), km)
-        task = final.start.task
+        task = final.start.goal
         within = jnp.abs(final.progress - task[:, None]) <= env.config.tolerance * task[:, None]
         outcome = {
             "success": final.success,
             "success_any_waypoint": final.valid & within.any(1),
             "in_collision": final.in_collision,
-            "lost_grip": ~final.in_collision & ~final.held,
+            "lost_grip": ~final.in_collision & ~final.grasp_held,
             "no_grasp": ~final.in_collision & ~final.valid & ~final.physics.diverged,
             "diverged": final.physics.diverged,
             "scene": final.physics.scene,
         } | ({} if score is None else {"said": score})
         rows.append(jax.device_get(outcome))
-        progress(min(trials, (batch + 1) * env.config.batch))
+        progress(min(trials, (batch + 1) * env.config.num_envs))
     joined = {name: np.concatenate([row[name] for row in rows])[:trials] for name in rows[0]}
     scenes = joined.pop("scene")
     per_object = {

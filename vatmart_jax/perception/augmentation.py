@@ -20,7 +20,7 @@ _MIRROR = np.array([1, -1, 1], np.float32)
 _MIRROR_TRAJECTORY = np.concatenate([_MIRROR, _MIRROR, np.tile(np.concatenate([_MIRROR, -_MIRROR]), WAYPOINTS)])
 
 
-class Transform(NamedTuple):
+class SceneTransform(NamedTuple):
     """Mirrored left to right where `mirrored`, then turned by `yaw` about z, then `scale` times as large about the
     origin of the object frame; three scalars."""
 
@@ -55,9 +55,9 @@ class Transform(NamedTuple):
         return jnp.array([[cos, sin, zero], [-sin, cos, zero], [zero, zero, zero + 1]])  # of row vectors
 
 
-def spread(count: int, yaw: float = 0.2) -> Transform:
+def tta_transforms(count: int, yaw: float = 0.2) -> SceneTransform:
     """`count` exact transforms [count] to ask the networks about: the scene as it is, then mirrored by turns, turned
     by up to `yaw` (rad), which training augments with too."""
     number = np.arange(count)
     turned = yaw * np.sin(2.4 * number)  # 2.4 rad: no two of a few are alike
-    return Transform(jnp.asarray(number % 2 == 1), jnp.asarray(turned, jnp.float32), jnp.ones(count))
+    return SceneTransform(jnp.asarray(number % 2 == 1), jnp.asarray(turned, jnp.float32), jnp.ones(count))

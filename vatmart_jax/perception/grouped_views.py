@@ -12,27 +12,27 @@ from flax import struct
 
 from vatmart_jax.data.banks import ViewBank
 from vatmart_jax.errors import UserError
-from vatmart_jax.perception.pointnet2 import Grouping, PointNetConfig, group
+from vatmart_jax.perception.pointnet2 import PointGroups, PointNet2Config, group
 
 
 @struct.dataclass
-class Clouds:
+class GroupedViews:
     """V views as the networks read them: N points each, the C contact candidates being the grouping's queries."""
 
     points: jax.Array  # [V, N, 3] float16, object frame
-    grouping: Grouping
+    point_groups: PointGroups
     joints: tuple[jax.Array, jax.Array] | None = None  # [V, 3] axes and anchors, see Env.joints; labels, never inputs
 
     @property
     def contacts(self) -> jax.Array:
         """[V, C, 3] float32, object frame."""
-        return self.grouping.queries
+        return self.point_groups.queries
 
     def __len__(self) -> int:
         return len(self.points)
 
 
-def points_of(bank: ViewBank, config: PointNetConfig) -> np.ndarray:
+def network_points(bank: ViewBank, config: PointNet2Config) -> np.ndarray:
     """The first n_points of every view. Raises UserError where the bank's views have fewer."""
     if bank.points.shape[1] < config.n_points:
         raise UserError(
@@ -42,14 +42,14 @@ def points_of(bank: ViewBank, config: PointNetConfig) -> np.ndarray:
     return bank.points[:, : config.n_points]
 
 
-def clouds_of(
-    bank: ViewBank, config: PointNetConfig, on_progress: Callable[[int, int], None] = lambda done, total: None
-) -> Clouds:
+def group_views(
+    bank: ViewBank, config: PointNet2Config, on_progress: Callable[[int, int], None] = lambda done, total: None
+) -> GroupedViews:
     """The points that the networks see of every view, grouped; `on_progress(done, total)` counts views.
 
     Raises UserError where the bank's views have too few.
     """
-    points = points_of(bank, config)
+    points = network_points(bank, config)
     total, size, parts = len(bank), 16, []
     for start in range(0, total, size):
         # The last batch is filled up with the last view: one shape, one compilation.
@@ -57,10 +57,10 @@ def clouds_of(
         found = jax.device_get(_group(points[rows], bank.contacts[rows], config))
         parts.append(found)
         on_progress(min(start + size, total), total)
-    grouping = jax.tree.map(lambda *a: jnp.asarray(np.concatenate(a)[:total]), *parts)
-    return Clouds(jnp.asarray(points, jnp.float16), grouping)
+    point_groups = jax.tree.map(lambda *a: jnp.asarray(np.concatenate(a)[:total]), *parts)
+    return GroupedViews(jnp.asarray(points, jnp.float16), point_groups)
 
 
 @partial(jax.jit, static_argnames=("config",))
-def _group(points: jax.Array, queries: jax.Array, config: PointNetConfig) -> Grouping:
+def _group(points: jax.Array, queries: jax.Array, config: PointNet2Config) -> PointGroups:
     return jax.vmap(lambda p, q: group(p, q, config))(points, queries)

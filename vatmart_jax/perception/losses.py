@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import optax
 
-from vatmart_jax.trajectory import since_start
+from vatmart_jax.trajectory import cumulative_residuals
 
 
 def score_loss(logits: jax.Array, labels: jax.Array) -> jax.Array:
@@ -27,8 +27,8 @@ def reconstruction_losses(
     gradient at 0; the squared distance of 6D numbers (Zhou et al. 2019) has, and keeps the raw output near unit length.
     """
     difference = predicted - truth
-    steps = jnp.abs(since_start(difference))
-    mean = lambda x: jnp.sum(x * weights) / jnp.maximum(weights.sum(), 1)  # noqa: E731
+    steps = jnp.abs(cumulative_residuals(difference))
+    mean = lambda x: jnp.sum(x * weights) / jnp.maximum(weights.sum(), 1)
     moves, turns = steps[..., :3].mean((-2, -1)), steps[..., 3:].mean((-2, -1))
     return mean(moves), mean(turns), mean(jnp.sum(difference[..., :6] ** 2, -1))
 

@@ -10,6 +10,7 @@ Source: Qi et al. 2017; sizes as in VAT-Mart's and Where2Act's released networks
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass
 
 import flax.linen as nn
@@ -20,69 +21,69 @@ from flax import struct
 
 
 @dataclass(frozen=True)
-class Level:
+class SetAbstraction:
     """One set abstraction level."""
 
-    centroids: int  # farthest-point samples of the level below
+    num_centroids: int  # farthest-point samples of the level below
     radius: float  # of a group, unit lengths
-    neighbours: int  # points of a group
+    max_neighbors: int  # points of a group
     widths: tuple[int, ...]  # of the network shared by all points of all groups
 
 
 @dataclass(frozen=True)
-class Around:
+class LocalGroup:
     """A group of the cloud's points about every query."""
 
     radius: float  # unit lengths
-    neighbours: int
+    max_neighbors: int
     widths: tuple[int, ...]
 
 
 @dataclass(frozen=True)
-class PointNetConfig:
+class PointNet2Config:
     """Sizes of one PointNet++; the defaults are the paper's."""
 
     n_points: int = 10_000
     """Points of a view that training sees; inference takes any number."""
-    levels: tuple[Level, ...] = (
-        Level(1024, 0.1, 32, (32, 32, 64)),
-        Level(256, 0.2, 32, (64, 64, 128)),
-        Level(64, 0.4, 32, (128, 128, 256)),
-        Level(16, 0.8, 32, (256, 256, 512)),
+    levels: tuple[SetAbstraction, ...] = (
+        SetAbstraction(1024, 0.1, 32, (32, 32, 64)),
+        SetAbstraction(256, 0.2, 32, (64, 64, 128)),
+        SetAbstraction(64, 0.4, 32, (128, 128, 256)),
+        SetAbstraction(16, 0.8, 32, (256, 256, 512)),
     )
     """Set abstraction, finest first."""
     propagation: tuple[tuple[int, ...], ...] = ((128, 128, 128), (256, 128), (256, 256), (256, 256))
     """Widths of the feature propagation into each level, finest (the queries) first."""
     feature_dim: int = 128
     """Width of a query's feature."""
-    around: tuple[Around, ...] = ()
+    local_groups: tuple[LocalGroup, ...] = ()
     """Groups about the queries themselves; the paper has none."""
-    context: tuple[int, ...] = ()
+    global_context: tuple[int, ...] = ()
     """Widths of a network over all of the second level's centroids as each query sees them; the paper has none."""
 
     def __post_init__(self) -> None:
         if len(self.levels) != len(self.propagation):
             raise ValueError(f"{len(self.levels)} levels need as many propagations, not {len(self.propagation)}")
-        if self.context and len(self.levels) < 2:
+        if self.global_context and len(self.levels) < 2:
             raise ValueError("a context needs two levels, for it is made of the second's centroids")
 
 
-SMALL = PointNetConfig(
+SMALL = PointNet2Config(
     n_points=4096,
     levels=(
-        Level(256, 0.15, 16, (32, 32, 64)),
-        Level(64, 0.3, 16, (64, 64, 128)),
-        Level(16, 0.7, 16, (128, 128, 256)),
+        SetAbstraction(256, 0.15, 16, (32, 32, 64)),
+        SetAbstraction(64, 0.3, 16, (64, 64, 128)),
+        SetAbstraction(16, 0.7, 16, (128, 128, 256)),
     ),
     propagation=((128, 128), (128, 128), (256, 128)),
-    around=(Around(0.06, 16, (32, 32, 64)), Around(0.15, 32, (32, 32, 64))),
-    context=(32, 64),
+    local_groups=(LocalGroup(0.06, 16, (32, 32, 64)), LocalGroup(0.15, 32, (32, 32, 64))),
+    global_context=(32, 64),
 )
 """A ninth of the paper's arithmetic per view, for two CPU cores."""
 
 
 @struct.dataclass
-class Grouping:
+class PointGroups:
     """The index structure of one view: N points, C queries, L levels with M_1 > ... > M_L centroids (M_0 = N).
 
     Indices are int16 where they fit, else int32; a batch of views has a leading dimension everywhere.
@@ -90,10 +91,10 @@ class Grouping:
 
     queries: jax.Array  # [C, 3] float32
     centroids: tuple[jax.Array, ...]  # L of [M_l], into level l - 1
-    neighbours: tuple[jax.Array, ...]  # L of [M_l, k_l], into level l - 1
+    neighbors: tuple[jax.Array, ...]  # L of [M_l, k_l], into level l - 1
     nearest: tuple[jax.Array, ...]  # L of [T, 3], into level l; T = C for l = 1, else M_{l-1}
     weights: tuple[jax.Array, ...]  # L of [T, 3] float16, inverse distances that sum to 1
-    around: tuple[jax.Array, ...]  # one of [C, k] for each of the config's, into the cloud
+    local_groups: tuple[jax.Array, ...]  # one of [C, k] for each of the config's, into the cloud
 
 
 def farthest_points(points: jax.Array, count: int) -> jax.Array:
@@ -166,39 +167,43 @@ def three_nearest(targets: jax.Array, sources: jax.Array) -> tuple[jax.Array, ja
     return jnp.stack(index, -1), inverse / inverse.sum(-1, keepdims=True)
 
 
-def group(points: jax.Array, queries: jax.Array, config: PointNetConfig) -> Grouping:
+def group(points: jax.Array, queries: jax.Array, config: PointNet2Config) -> PointGroups:
     """The Grouping of a cloud [N, 3] and queries [C, 3]. Jits, and vmaps over views.
 
     Points should be in random order (see `ball_query`).
     """
     points, queries = points.astype(jnp.float32), queries.astype(jnp.float32)
-    centroids, neighbours, nearest, weights = [], [], [], []
+    centroids, neighbors, nearest, weights = [], [], [], []
     below, targets = points, queries
     for level in config.levels:
-        chosen = farthest_points(below, level.centroids)
+        chosen = farthest_points(below, level.num_centroids)
         xyz = below[chosen]
-        members = ball_query(below, xyz, level.radius, level.neighbours)
+        members = ball_query(below, xyz, level.radius, level.max_neighbors)
         closest, weight = three_nearest(targets, xyz)
         centroids.append(_compact(chosen, len(below)))
-        neighbours.append(_compact(members, len(below)))
-        nearest.append(_compact(closest, level.centroids))
+        neighbors.append(_compact(members, len(below)))
+        nearest.append(_compact(closest, level.num_centroids))
         weights.append(weight.astype(jnp.float16))
         below = targets = xyz
-    around = tuple(_compact(ball_query(points, queries, a.radius, a.neighbours), len(points)) for a in config.around)
-    return Grouping(queries, tuple(centroids), tuple(neighbours), tuple(nearest), tuple(weights), around)
+    local_groups = tuple(
+        _compact(ball_query(points, queries, a.radius, a.max_neighbors), len(points)) for a in config.local_groups
+    )
+    return PointGroups(queries, tuple(centroids), tuple(neighbors), tuple(nearest), tuple(weights), local_groups)
 
 
-def surroundings(points: jax.Array, grouping: Grouping, which: jax.Array | None = None) -> tuple[jax.Array, ...]:
+def local_offsets(
+    points: jax.Array, point_groups: PointGroups, which: jax.Array | None = None
+) -> tuple[jax.Array, ...]:
     """Offsets [Q, k, 3] from queries to the points of each group about them.
 
     points: [N, 3]. which: [Q] int into the queries, None for all.
     """
     of_query = (lambda x: x) if which is None else (lambda x: _take(x, which))
-    place = of_query(grouping.queries)[:, None]
-    return tuple(_take(points.astype(jnp.float32), of_query(members)) - place for members in grouping.around)
+    place = of_query(point_groups.queries)[:, None]
+    return tuple(_take(points.astype(jnp.float32), of_query(members)) - place for members in point_groups.local_groups)
 
 
-class Shared(nn.Module):
+class SharedMLP(nn.Module):
     """Dense layers with ReLU, the same for every point [..., d] -> [..., widths[-1]].
 
     Without normalisation: batch statistics would be mutable state and tie a view's features to its batch, and layer
@@ -217,42 +222,47 @@ class Shared(nn.Module):
 class PointNet2(nn.Module):
     """Features of the queries of one view; vmap it over views."""
 
-    config: PointNetConfig
+    config: PointNet2Config
 
     @nn.compact
-    def __call__(self, points: jax.Array, grouping: Grouping, which: jax.Array | None = None) -> jax.Array:
+    def __call__(self, points: jax.Array, point_groups: PointGroups, which: jax.Array | None = None) -> jax.Array:
         """points: [N, 3]. which: [Q] int into the queries, None for all. Returns [Q, feature_dim]."""
-        levels = self.config.levels
+        levels, number = self.config.levels, itertools.count()
+
+        def mlp(widths: tuple[int, ...]) -> SharedMLP:
+            # A module's initial values follow from its name: these are the names that trained parameters have.
+            return SharedMLP(widths, name=f"Shared_{next(number)}")
+
         xyz = points.astype(jnp.float32)
         skips, centroids = [xyz], [xyz]
-        for level, chosen, members in zip(levels, grouping.centroids, grouping.neighbours, strict=True):
+        for level, chosen, members in zip(levels, point_groups.centroids, point_groups.neighbors, strict=True):
             centres = _take(xyz, chosen)
             offset = (_take(xyz, members) - centres[:, None]) / level.radius
             grouped = jnp.concatenate([offset, _take(skips[-1], members)], -1)
-            skips.append(Shared(level.widths)(grouped).max(-2))
+            skips.append(mlp(level.widths)(grouped).max(-2))
             xyz = centres
             centroids.append(xyz)
-        skips[0] = grouping.queries if which is None else _take(grouping.queries, which)
+        skips[0] = point_groups.queries if which is None else _take(point_groups.queries, which)
         features = skips[-1]
         for depth in reversed(range(len(levels))):
-            nearest, weights = grouping.nearest[depth], grouping.weights[depth]
+            nearest, weights = point_groups.nearest[depth], point_groups.weights[depth]
             if depth == 0 and which is not None:
                 nearest, weights = _take(nearest, which), _take(weights, which)
-            spread = jnp.sum(_take(features, nearest) * weights[..., None].astype(jnp.float32), -2)
-            features = Shared(self.config.propagation[depth])(jnp.concatenate([spread, skips[depth]], -1))
+            tta_transforms = jnp.sum(_take(features, nearest) * weights[..., None].astype(jnp.float32), -2)
+            features = mlp(self.config.propagation[depth])(jnp.concatenate([tta_transforms, skips[depth]], -1))
         parts = [features]
-        for kind, offset in zip(self.config.around, surroundings(points, grouping, which), strict=True):
+        for kind, offset in zip(self.config.local_groups, local_offsets(points, point_groups, which), strict=True):
             offset = offset / kind.radius
             # A query with no point near has one from elsewhere, at a distance that means nothing.
             inside = jnp.sum(offset**2, -1, keepdims=True) <= 1.01
-            parts.append(jnp.where(inside, Shared(kind.widths)(offset), 0.0).max(-2))
-        if self.config.context:
+            parts.append(jnp.where(inside, mlp(kind.widths)(offset), 0.0).max(-2))
+        if self.config.global_context:
             # A dense layer of a centroid's feature and its offset from the query, the sum of what each contributes.
-            width, *more = self.config.context
+            width, *more = self.config.global_context
             place = nn.Dense(width, use_bias=False, name="context_place")
             seen = nn.Dense(width, name="context_seen")(skips[2]) + place(centroids[2])
-            parts.append(Shared(tuple(more))(nn.relu(seen - place(skips[0])[:, None])).max(-2))
-        return Shared((self.config.feature_dim,))(jnp.concatenate(parts, -1))
+            parts.append(mlp(tuple(more))(nn.relu(seen - place(skips[0])[:, None])).max(-2))
+        return mlp((self.config.feature_dim,))(jnp.concatenate(parts, -1))
 
 
 def _take(x: jax.Array, index: jax.Array) -> jax.Array:

@@ -19,36 +19,36 @@ from flax import struct
 from optax.contrib import muon
 
 from vatmart_jax.perception import losses
-from vatmart_jax.perception.augmentation import Transform
-from vatmart_jax.perception.grouped_views import Clouds
+from vatmart_jax.perception.augmentation import SceneTransform
+from vatmart_jax.perception.grouped_views import GroupedViews
 from vatmart_jax.perception.networks import (
     Features,
     Networks,
     NetworksConfig,
     Params,
-    course_of,
-    pack_course,
-    places_and_turn,
+    articulation_flow,
+    pack_flow,
+    unpack_flow,
 )
-from vatmart_jax.perception.pointnet2 import Grouping
-from vatmart_jax.perception.predictor import Ensemble
+from vatmart_jax.perception.pointnet2 import PointGroups
+from vatmart_jax.perception.predictor import TTAPredictor
 from vatmart_jax.trajectory import WAYPOINTS
 
 
 @struct.dataclass
-class Samples:
+class Interactions:
     """M executed trajectories and what they did; rows with view -1 are empty."""
 
     view: jax.Array  # [M] int32, index into Clouds
     contact: jax.Array  # [M] int32, index into that view's contacts
-    task: jax.Array  # [M] commanded amount > 0, rad or unit lengths
+    goal: jax.Array  # [M] commanded displacement > 0, rad or unit lengths
     trajectory: jax.Array  # [M, 30] see geometry.pack_trajectory
-    moved: jax.Array  # [M] how far the part moved in the task's sense, unit of `task`
+    displacement: jax.Array  # [M] how far the part moved in the task's sense, unit of `goal`
     valid: jax.Array  # [M] bool, success was possible: free start, grasp made and kept, physics sound
-    proposed: jax.Array  # [M] bool, the networks proposed it; if not, it is the policy's or an expert's
+    from_proposal: jax.Array  # [M] bool, the networks proposed it; if not, it is the policy's or an expert's
 
     @classmethod
-    def empty(cls, capacity: int) -> Samples:
+    def empty(cls, capacity: int) -> Interactions:
         """A buffer of `capacity` empty rows."""
         zeros = jnp.zeros(capacity)
         return cls(
@@ -56,14 +56,14 @@ class Samples:
             jnp.zeros((capacity, 6 + 6 * WAYPOINTS)), zeros, jnp.zeros(capacity, bool), jnp.zeros(capacity, bool),
         )  # fmt: skip
 
-    def stored(self, new: Samples, at: jax.Array | int) -> Samples:
+    def insert(self, new: Interactions, at: jax.Array | int) -> Interactions:
         """The buffer with `new` written from row `at` on, around its end."""
         rows = (at + jnp.arange(len(new.view))) % len(self.view)
         return jax.tree.map(lambda old, value: old.at[rows].set(value), self, new)
 
     def success(self, tolerance: float) -> jax.Array:
         """[M] bool, the commanded task was done."""
-        return self.valid & (jnp.abs(self.moved - self.task) <= tolerance * self.task)
+        return self.valid & (jnp.abs(self.displacement - self.goal) <= tolerance * self.goal)
 
 
 @dataclass(frozen=True)
@@ -77,21 +77,21 @@ class PerceptionConfig:
     """largest task"""
     tolerance: float = 0.15
     """success: the part moved by the task within this share of it"""
-    views: int = 8
+    views_per_batch: int = 8
     """views per step"""
-    queries: int = 48
+    samples_per_view: int = 48
     """samples per view and step"""
-    probes: int = 16
+    actionability_queries: int = 16
     """random contacts per view and step, for actionability; at most `queries`"""
-    proposals: int = 100
+    num_proposals: int = 100
     """trajectories proposed at a probe"""
-    best: int = 5
+    top_k: int = 5
     """the probe's actionability is the mean score of so many best proposals"""
-    proposed: float = 0.5
+    proposal_fraction: float = 0.5
     """share of a view's samples that are of the networks' own proposals, where it has both kinds"""
-    hindsight: float = 0.5
+    relabel_fraction: float = 0.5
     """share of the scorer's rows whose task is what the trajectory achieved, within the tolerance"""
-    shifted: float = 0.3
+    negative_fraction: float = 0.3
     """share whose task is shifted off that; the rest keep the commanded task, failed starts and grasps among them"""
     shift: float = 0.45
     """largest shift; the paper has 0.45 for drawers and 45 degrees for doors"""
@@ -105,37 +105,37 @@ class PerceptionConfig:
     """drawers: tasks grow with the view, parts move along their axis and do not turn"""
     learning_rate: float = 2e-3
     """after 100 steps of warm-up; falls along a cosine to a fiftieth at the stage's end"""
-    encoder_rate: float = 1.0
+    encoder_lr_scale: float = 1.0
     """share of that for encoder and course, where there is one, in the stages `scorer` and `proposal`, whose fresh
-    heads undo some of what a long `course` stage has taught them"""
+    heads undo some of what a long `flow` stage has taught them"""
     muon: bool = True
     """Muon for all matrices: their momentum made orthogonal, at the size of Adam's steps; the paper has Adam"""
     weight_decay: float = 1e-4
     """decoupled, as in AdamW"""
     score_weight: float = 5.0
     """of the scorer's cross-entropy"""
-    move_weight: float = 50.0
+    position_weight: float = 50.0
     """of the L1 of waypoint moves, per unit length"""
-    turn_weight: float = 50.0
+    euler_weight: float = 50.0
     """of the L1 of waypoint Euler residuals, per rad"""
     rotation_weight: float = 5.0
     """of the squared 6D distance of start rotations"""
     kl_weight: float = 1.0
     """of the KL divergence; at 0.05 the decoder's samples ignore contact and task"""
-    kl_free: float = 6.0
+    free_bits: float = 6.0
     """nats of it that cost nothing, so that the posterior does not collapse before the decoder has learned to listen"""
-    course_weight: float = 50.0
+    flow_weight: float = 50.0
     """of the L1 of the touched point's course, and of its hinge where the networks tell it"""
-    course_noise: float = 0.15
+    flow_noise: float = 0.15
     """the scorer learns with courses off by about this share, as they are on objects that it has not seen"""
     actionability_weight: float = 5.0
     """of the L1 of actionability"""
-    steps_per_call: int = 50
+    log_every: int = 50
     """steps between two reports"""
 
     def __post_init__(self) -> None:
-        if self.probes > self.queries:
-            raise ValueError(f"probes ({self.probes}) must not exceed queries ({self.queries})")
+        if self.actionability_queries > self.samples_per_view:
+            raise ValueError(f"probes ({self.actionability_queries}) must not exceed queries ({self.samples_per_view})")
 
 
 @struct.dataclass
@@ -149,11 +149,11 @@ class PerceptionState:
 
 
 STAGES: dict[str, tuple[str, ...]] = {
-    "course": ("course",),
-    "scorer": ("course", "scorer"),
-    "proposal": ("course", "scorer", "proposal"),
+    "flow": ("flow",),
+    "scorer": ("flow", "scorer"),
+    "proposal": ("flow", "scorer", "proposal"),
     "actionability": ("actionability",),
-    "joint": ("course", "scorer", "proposal", "actionability"),
+    "joint": ("flow", "scorer", "proposal", "actionability"),
 }
 """The heads that each stage trains; those not named stay as they are. A shared encoder learns wherever the course does.
 
@@ -175,7 +175,7 @@ class Batch(NamedTuple):
     """V views of a step, Q samples and R probes each."""
 
     points: jax.Array  # [V, N, 3]
-    grouping: Grouping
+    point_groups: PointGroups
     which: jax.Array  # [V, Q + R] contacts of the samples, then of the probes
     trajectory: jax.Array  # [V, Q, 30]
     task: jax.Array  # [V, Q] the scorer's
@@ -195,8 +195,8 @@ def begin(key: jax.Array, config: PerceptionConfig) -> PerceptionState:
 
 def train(
     state: PerceptionState,
-    clouds: Clouds,
-    samples: Samples,
+    grouped_views: GroupedViews,
+    samples: Interactions,
     config: PerceptionConfig,
     stage: str,
     steps: int,
@@ -205,66 +205,70 @@ def train(
     """Train one of STAGES to its end, from the step where `state` stands.
 
     `on_metrics` gets the state, which may be saved to resume from, and the mean of every raw loss over the last
-    `steps_per_call` steps. Returns the state with its step back at 0. Raises ValueError where there are no samples.
+    `log_every` steps. Returns the state with its step back at 0. Raises ValueError where there are no samples.
     """
-    index = _index(samples, len(clouds))
+    index = _index(samples, len(grouped_views))
     if int(index.total) == 0:
         raise ValueError(f"nothing to train the {stage} stage on: the buffer has no samples")
-    if config.networks.course and clouds.joints is None:
+    if config.networks.flow_hidden and grouped_views.joints is None:
         raise ValueError("the networks' course has nothing to learn from: the clouds come without joints")
     done = int(state.step)
     if done == 0:  # the moments of the last stage belong to other losses
         state = replace(state, optimizer=_moments(config, state.params))
     while done < steps:
-        count = min(config.steps_per_call, steps - done)
-        state, sums = _steps(config, stage, state, clouds, samples, index, count, steps)
+        count = min(config.log_every, steps - done)
+        state, sums = _steps(config, stage, state, grouped_views, samples, index, count, steps)
         done += count
         on_metrics(state, {"step": done} | {name: float(value) / count for name, value in sums.items()})
     return replace(state, step=jnp.int32(0))
 
 
 @partial(jax.jit, static_argnames=("n_views",))
-def _index(samples: Samples, n_views: int) -> Index:
-    place = jnp.where(samples.view < 0, 2 * n_views, 2 * samples.view + samples.proposed)
+def _index(samples: Interactions, n_views: int) -> Index:
+    place = jnp.where(samples.view < 0, 2 * n_views, 2 * samples.view + samples.from_proposal)
     count = jnp.zeros(2 * n_views + 1, jnp.int32).at[place].add(1)
     start = jnp.cumsum(count) - count
     start, count = (a[:-1].reshape(n_views, 2) for a in (start, count))
     return Index(jnp.argsort(place).astype(jnp.int32), start, count, count.sum())
 
 
-def _draw(key: jax.Array, clouds: Clouds, samples: Samples, index: Index, config: PerceptionConfig) -> Batch:
+def _draw(
+    key: jax.Array, grouped_views: GroupedViews, samples: Interactions, index: Index, config: PerceptionConfig
+) -> Batch:
     """Views, as often as trials were made in them, and samples of both kinds of each, uniformly and with replacement.
 
     Trials are balanced over categories and objects, so views are. Consumes the key.
     """
     k_view, k_kind, k_row, k_task, k_probe, k_augment = jax.random.split(key, 6)
-    shape = (config.views, config.queries)
-    view = samples.view[index.rows[jax.random.randint(k_view, (config.views,), 0, index.total)]]
+    shape = (config.views_per_batch, config.samples_per_view)
+    view = samples.view[index.rows[jax.random.randint(k_view, (config.views_per_batch,), 0, index.total)]]
     count = index.count[view][:, None]
-    proposed = jax.random.bernoulli(k_kind, config.proposed, shape)
+    proposed = jax.random.bernoulli(k_kind, config.proposal_fraction, shape)
     kind = jnp.where((count > 0).all(-1), proposed, count[..., 1] > 0).astype(jnp.int32)
     count, start = (jnp.take_along_axis(a[view], kind, 1) for a in (index.count, index.start))
     offset = jnp.floor(jax.random.uniform(k_row, shape) * count).astype(jnp.int32)
     row = index.rows[start + jnp.minimum(offset, count - 1)]
-    moved, valid, commanded = samples.moved[row], samples.valid[row], samples.task[row]
+    moved, valid, commanded = samples.displacement[row], samples.valid[row], samples.goal[row]
     achieved = valid & (moved >= config.low) & (moved <= config.high)
     task = jnp.where(achieved, _relabelled(k_task, moved, commanded, config), commanded)
     label = valid & (jnp.abs(moved - task) <= config.tolerance * task)
-    probes = jax.random.randint(k_probe, (config.views, config.probes), 0, clouds.contacts.shape[1])
+    probes = jax.random.randint(
+        k_probe, (config.views_per_batch, config.actionability_queries), 0, grouped_views.contacts.shape[1]
+    )
     return _augmented(
         k_augment,
         config,
         Batch(
-            clouds.points[view].astype(jnp.float32),
-            jax.tree.map(lambda a: a[view], clouds.grouping),
+            grouped_views.points[view].astype(jnp.float32),
+            jax.tree.map(lambda a: a[view], grouped_views.point_groups),
             jnp.concatenate([samples.contact[row], probes], -1),
             samples.trajectory[row],
             task,
             label.astype(jnp.float32),
             jnp.where(achieved, moved, config.low),
             achieved.astype(jnp.float32),
-            commanded[:, : config.probes],
-            jax.tree.map(lambda a: a[view], clouds.joints) if config.networks.course else None,
+            commanded[:, : config.actionability_queries],
+            jax.tree.map(lambda a: a[view], grouped_views.joints) if config.networks.flow_hidden else None,
         ),
     )
 
@@ -276,7 +280,7 @@ def _relabelled(key: jax.Array, moved: jax.Array, commanded: jax.Array, config: 
     shifted task lies outside the tolerance.
     """
     k_kind, k_near, k_side, k_shift = jax.random.split(key, 4)
-    uniform = lambda key, low, high: low + (high - low) * jax.random.uniform(key, moved.shape)  # noqa: E731
+    uniform = lambda key, low, high: low + (high - low) * jax.random.uniform(key, moved.shape)
     kind = jax.random.uniform(k_kind, moved.shape)
     lower, upper = moved / (1 + config.tolerance), moved / (1 - config.tolerance)
     near = jnp.clip(uniform(k_near, lower, upper), config.low, config.high)
@@ -286,7 +290,11 @@ def _relabelled(key: jax.Array, moved: jax.Array, commanded: jax.Array, config: 
     can_down, can_up = lower > config.low, upper < config.high
     off = jnp.where((side & can_down) | ~can_up, down, up)
     off = jnp.where(can_down | can_up, off, commanded)
-    return jnp.where(kind < config.hindsight, near, jnp.where(kind < config.hindsight + config.shifted, off, commanded))
+    return jnp.where(
+        kind < config.relabel_fraction,
+        near,
+        jnp.where(kind < config.relabel_fraction + config.negative_fraction, off, commanded),
+    )
 
 
 def _augmented(key: jax.Array, config: PerceptionConfig, batch: Batch) -> Batch:
@@ -297,11 +305,11 @@ def _augmented(key: jax.Array, config: PerceptionConfig, batch: Batch) -> Batch:
     yaw = jax.random.uniform(k_yaw, views, minval=-config.yaw, maxval=config.yaw)
     limit = math.log1p(config.scale)
     scale = jnp.exp(jax.random.uniform(k_scale, views, minval=-limit, maxval=limit))
-    transform = Transform(mirrored, yaw, scale)
+    transform = SceneTransform(mirrored, yaw, scale)
     return jax.vmap(partial(transformed, task_is_length=config.task_is_length))(batch, transform)
 
 
-def transformed(batch: Batch, transform: Transform, task_is_length: bool = False) -> Batch:
+def transformed(batch: Batch, transform: SceneTransform, task_is_length: bool = False) -> Batch:
     """One view of a Batch, mirrored, turned and scaled with all that belongs to it."""
     if batch.joints is not None:
         axis, anchor = transform.directions(batch.joints[0]), transform.points(batch.joints[1])
@@ -310,7 +318,7 @@ def transformed(batch: Batch, transform: Transform, task_is_length: bool = False
         batch = batch._replace(joints=(axis, anchor))
     return batch._replace(
         points=transform.points(batch.points),
-        grouping=replace(batch.grouping, queries=transform.points(batch.grouping.queries)),
+        point_groups=replace(batch.point_groups, queries=transform.points(batch.point_groups.queries)),
         trajectory=transform.trajectory(batch.trajectory),
         task=transform.task(batch.task, task_is_length),
         achieved=transform.task(batch.achieved, task_is_length),
@@ -324,29 +332,29 @@ def _loss(
     """The weighted sum of a stage's losses, and each of them raw. Consumes the key."""
     networks, heads = Networks(config.networks), _heads(config, stage)
     k_posterior, k_proposals, k_course = jax.random.split(key, 3)
-    f = jax.vmap(networks.features, (None, 0, 0, 0))(params, batch.points, batch.grouping, batch.which)
-    contact = jnp.take_along_axis(batch.grouping.queries, batch.which[..., None], 1)
+    f = jax.vmap(networks.features, (None, 0, 0, 0))(params, batch.points, batch.point_groups, batch.which)
+    contact = jnp.take_along_axis(batch.point_groups.queries, batch.which[..., None], 1)
     n = batch.task.shape[1]
     of_samples, of_probes = Features(*(x[:, :n] for x in f)), Features(*(x[:, n:] for x in f))
-    total, metrics, course = jnp.float32(0), {}, None
-    if "course" in heads:
+    total, metrics, flow = jnp.float32(0), {}, None
+    if "flow" in heads:
         task = jnp.concatenate([batch.task, batch.probe_task], -1)
-        truth = true_course(contact, *batch.joints, task, hinge=not config.task_is_length)  # pyright: ignore
-        said = networks.course(params, f, contact, task)
-        course = _disturbed(k_course, said[:, :n], config.course_noise)
+        truth = flow_target(contact, *batch.joints, task, hinge=not config.task_is_length)  # pyright: ignore
+        said = networks.flow(params, f, contact, task)
+        flow = _disturbed(k_course, said[:, :n], config.flow_noise)
         off = said - truth
         loss = jnp.abs(off).mean()
-        total += config.course_weight * loss
-        if config.networks.hinge:  # the arc alone teaches slowly where its axis is
-            axis, arm = networks.hinge(params, f, contact, task)
-            true_axis, true_arm = true_hinge(contact, *batch.joints)  # pyright: ignore
-            hinge_loss = jnp.abs(axis - true_axis).mean() + 2 * jnp.abs(arm - true_arm).mean()
-            total += config.course_weight * hinge_loss
-            metrics |= {"hinge_loss": hinge_loss}
-        places, _ = places_and_turn(off)
-        metrics |= {"course_loss": loss, "course_error": jnp.linalg.norm(places[..., -1, :], axis=-1).mean()}
+        total += config.flow_weight * loss
+        if config.networks.predict_axis:  # the arc alone teaches slowly where its axis is
+            axis, arm = networks.joint_axis(params, f, contact, task)
+            true_axis, true_arm = axis_target(contact, *batch.joints)  # pyright: ignore
+            axis_loss = jnp.abs(axis - true_axis).mean() + 2 * jnp.abs(arm - true_arm).mean()
+            total += config.flow_weight * axis_loss
+            metrics |= {"axis_loss": axis_loss}
+        places, _ = unpack_flow(off)
+        metrics |= {"flow_loss": loss, "flow_error": jnp.linalg.norm(places[..., -1, :], axis=-1).mean()}
     if "scorer" in heads:
-        logits = networks.score(params, of_samples, contact[:, :n], batch.task, batch.trajectory, course)
+        logits = networks.score(params, of_samples, contact[:, :n], batch.task, batch.trajectory, flow)
         loss = losses.score_loss(logits, batch.label)
         total += config.score_weight * loss
         accuracy = jnp.mean((logits > 0) == (batch.label > 0.5))
@@ -358,56 +366,56 @@ def _loss(
         decoded = networks.decode(params, of_samples, *where, z)
         move, turn, rotation = losses.reconstruction_losses(decoded, batch.trajectory, batch.weight)
         kl = losses.kl_loss(mean, log_variance, batch.weight)
-        total += config.move_weight * move + config.turn_weight * turn
-        total += config.rotation_weight * rotation + config.kl_weight * jnp.maximum(kl, config.kl_free)
-        metrics |= {"move_loss": move, "turn_loss": turn, "rotation_loss": rotation, "kl_loss": kl}
+        total += config.position_weight * move + config.euler_weight * turn
+        total += config.rotation_weight * rotation + config.kl_weight * jnp.maximum(kl, config.free_bits)
+        metrics |= {"position_loss": move, "euler_loss": turn, "rotation_loss": rotation, "kl_loss": kl}
     if "actionability" in heads:
         where = (contact[:, n:], batch.probe_task)
         logits = networks.actionability(params, of_probes, *where)
         itself = Features(*(x[None] for x in of_probes))
-        _, scores = Ensemble(networks).propose(params, itself, *where, k_proposals, config.proposals)
-        target = jax.lax.stop_gradient(losses.actionability_target(scores, config.best))
+        _, scores = TTAPredictor(networks).propose(params, itself, *where, k_proposals, config.num_proposals)
+        target = jax.lax.stop_gradient(losses.actionability_target(scores, config.top_k))
         loss = losses.actionability_loss(logits, target)
         total += config.actionability_weight * loss
         metrics |= {"actionability_loss": loss, "actionability_target": target.mean()}
     return total, metrics | {"loss": total}
 
 
-def true_course(contact: jax.Array, axis: jax.Array, anchor: jax.Array, task: jax.Array, hinge: bool) -> jax.Array:
-    """[V, Q, 15] what `Networks.course` should say of contacts [V, Q, 3] and tasks [V, Q] where the joints are axis
+def flow_target(contact: jax.Array, axis: jax.Array, anchor: jax.Array, task: jax.Array, hinge: bool) -> jax.Array:
+    """[V, Q, 15] what `Networks.flow` should say of contacts [V, Q, 3] and tasks [V, Q] where the joints are axis
     and anchor [V, 3]."""
-    return course_of(axis[:, None], anchor[:, None] - contact, task, hinge)
+    return articulation_flow(axis[:, None], anchor[:, None] - contact, task, hinge)
 
 
-def true_hinge(contact: jax.Array, axis: jax.Array, anchor: jax.Array) -> tuple[jax.Array, jax.Array]:
+def axis_target(contact: jax.Array, axis: jax.Array, anchor: jax.Array) -> tuple[jax.Array, jax.Array]:
     """What `Networks.hinge` should say of contacts [V, Q, 3] where the hinges are axis and anchor [V, 3]: the axis
     [V, 1, 3], and the way [V, Q, 3] from the contact to the nearest point on it."""
     axis, arm = axis[:, None], anchor[:, None] - contact
     return axis, arm - axis * jnp.sum(axis * arm, -1, keepdims=True)
 
 
-def _disturbed(key: jax.Array, course: jax.Array, share: float) -> jax.Array:
+def _disturbed(key: jax.Array, flow: jax.Array, share: float) -> jax.Array:
     """Courses [V, Q, 15] longer or shorter, bent aside and turned otherwise by about `share`. Consumes the key."""
     k_length, k_side, k_turn = jax.random.split(key, 3)
-    places, turn = places_and_turn(course)
+    places, turn = unpack_flow(flow)
     length = jnp.linalg.norm(places[..., -1:, :], axis=-1, keepdims=True)
     aside = jnp.arange(1, WAYPOINTS + 1)[:, None] / WAYPOINTS * length
-    normal = lambda key, of: jax.random.normal(key, of.shape)  # noqa: E731
+    normal = lambda key, of: jax.random.normal(key, of.shape)
     places = places * jnp.exp(share * normal(k_length, length)) + share * aside * normal(k_side, places[..., :1, :])
     turn = turn + share * jnp.linalg.norm(turn, axis=-1, keepdims=True) * normal(k_turn, turn)
-    return pack_course(places, turn)
+    return pack_flow(places, turn)
 
 
 def _heads(config: PerceptionConfig, stage: str) -> tuple[str, ...]:
     """The heads of a stage that these networks have."""
-    return tuple(head for head in STAGES[stage] if head != "course" or config.networks.course)
+    return tuple(head for head in STAGES[stage] if head != "flow" or config.networks.flow_hidden)
 
 
 def _trained(config: PerceptionConfig, stage: str) -> set[str]:
     """Names in the parameters of the networks that a stage trains."""
     heads = _heads(config, stage)
     names = {name for head in heads for name in (("posterior", "decoder") if head == "proposal" else (head,))}
-    if config.networks.separate or "course" in STAGES[stage]:
+    if config.networks.separate_encoders or "flow" in STAGES[stage]:
         names |= set(Networks(config.networks).encoders(*heads))
     return names
 
@@ -436,24 +444,24 @@ def _steps(
     config: PerceptionConfig,
     stage: str,
     state: PerceptionState,
-    clouds: Clouds,
-    samples: Samples,
+    grouped_views: GroupedViews,
+    samples: Interactions,
     index: Index,
     count: int,
     steps: int,
 ) -> tuple[PerceptionState, dict[str, jax.Array]]:
     """`count` steps of a stage of `steps`, both traced, and the sums of their metrics."""
     trained = _trained(config, stage)
-    slower = {"encoder", "course"} if config.networks.course and stage in ("scorer", "proposal") else set()
-    shares = {name: config.encoder_rate if name in slower else 1.0 for name in trained}
+    slower = {"encoder", "flow"} if config.networks.flow_hidden and stage in ("scorer", "proposal") else set()
+    shares = {name: config.encoder_lr_scale if name in slower else 1.0 for name in trained}
 
     def step(state: PerceptionState) -> tuple[PerceptionState, dict[str, jax.Array]]:
         key, k_draw, k_loss = jax.random.split(jax.random.wrap_key_data(state.key), 3)
-        batch = _draw(k_draw, clouds, samples, index, config)
+        batch = _draw(k_draw, grouped_views, samples, index, config)
         # Only what a stage trains is differentiated, and only that is changed: no momentum or decay for the rest.
         part = {name: p for name, p in state.params.items() if name in trained}
         rest = jax.lax.stop_gradient(state.params)
-        loss = lambda part: _loss(rest | part, batch, k_loss, config, stage)  # noqa: E731
+        loss = lambda part: _loss(rest | part, batch, k_loss, config, stage)
         (_, metrics), gradients = jax.value_and_grad(loss, has_aux=True)(part)
         gradients = {name: gradients.get(name, jax.tree.map(jnp.zeros_like, p)) for name, p in state.params.items()}
         updates, optimizer = _optimizer(config).update(gradients, state.optimizer, state.params)

@@ -78,7 +78,7 @@ class CPhysics:
         batch = np.shape(state.scene)
         scene = np.asarray(state.scene).reshape(-1)
         pose = np.asarray(state.gripper_pose, np.float64).reshape(-1, 7)
-        exact = np.ascontiguousarray(np.asarray(state.exact)).reshape(len(scene), -1).view(np.float64).copy()
+        exact = np.ascontiguousarray(np.asarray(state.backend_state)).reshape(len(scene), -1).view(np.float64).copy()
         ctrl = np.asarray(ctrl, np.float64).reshape(len(scene), -1, N_CTRL)
         diverged = np.array(state.diverged).reshape(-1)
         contact = np.array(state.in_contact).reshape(-1)

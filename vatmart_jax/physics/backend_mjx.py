@@ -26,7 +26,7 @@ RENEW = 4
 ITERATIONS, LS_ITERATIONS = 5, 5
 
 
-class Slots(NamedTuple):
+class CollisionSlots(NamedTuple):
     """What fills N slots of a body, and oriented boxes around it; body frame."""
 
     pos: jax.Array  # [..., N, 3] of the geom
@@ -41,8 +41,8 @@ class SceneRow(NamedTuple):
     """A Scene as leaves of an mjx.Model."""
 
     fields: dict[str, jax.Array]  # of bodies, joints and degrees of freedom
-    static: Slots
-    part: Slots
+    static: CollisionSlots
+    part: CollisionSlots
 
 
 class MjxPhysics:
@@ -102,26 +102,26 @@ class MjxPhysics:
             return (near, *after, sound), None
 
         sound = jnp.isfinite(ctrl).all((-1, -2))
-        warmstart = jax.lax.bitcast_convert_type(state.exact, jnp.float32)
+        warmstart = jax.lax.bitcast_convert_type(state.backend_state, jnp.float32)
         # Filled in by the first step; a call here would be compiled once more.
         near = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), jax.eval_shape(nearest, rows, pose, state.qpos))
         begin = (near, state.qpos, state.qvel, warmstart, state.in_contact, sound)
         steps = jnp.arange(ctrl.shape[1]), jnp.asarray(ctrl).swapaxes(0, 1)
         (_, qpos, qvel, warmstart, touches, sound), _ = jax.lax.scan(step, begin, steps)
         runs = active & ~state.diverged
-        kept = lambda new, old: jnp.where((runs & sound)[:, None], new, old)  # noqa: E731
+        kept = lambda new, old: jnp.where((runs & sound)[:, None], new, old)
         return state.replace(
             qpos=kept(qpos, state.qpos),
             qvel=kept(qvel, state.qvel),
             in_contact=jnp.where(runs & sound, touches, state.in_contact),
             diverged=state.diverged | (runs & ~sound),
-            exact=kept(bits_of(warmstart), state.exact),
+            backend_state=kept(bits_of(warmstart), state.backend_state),
         )
 
     def _rows(self, scene: jax.Array) -> SceneRow:
         return jax.tree.map(lambda table: table[scene], self._scenes)
 
-    def _step(self, row: SceneRow, pose, near: Slots, qpos, qvel, warmstart, ctrl):
+    def _step(self, row: SceneRow, pose, near: CollisionSlots, qpos, qvel, warmstart, ctrl):
         """One step of one simulation: its new qpos, qvel, qacc_warmstart, and whether it is in contact."""
         data = self._data.replace(qpos=qpos, qvel=qvel, qacc_warmstart=warmstart, ctrl=ctrl)
         model = self._with_slots(self._placed(row, pose), near)
@@ -150,7 +150,7 @@ class MjxPhysics:
             body_quat=model.body_quat.at[self._base].set(pose[3:]),
         )
 
-    def _nearest(self, row: SceneRow, pose: jax.Array, qpos: jax.Array) -> Slots:
+    def _nearest(self, row: SceneRow, pose: jax.Array, qpos: jax.Array) -> CollisionSlots:
         """The slots nearest to each of the gripper's boxes: the static ones, then the part's."""
         model = self._placed(row, pose)
         at = mjx.kinematics(model, self._data.replace(qpos=qpos))
@@ -159,7 +159,7 @@ class MjxPhysics:
         part = _nearest(row.part, at.xpos[self._part], at.xmat[self._part], *boxes, self._near[1])
         return jax.tree.map(lambda *x: jnp.concatenate(x), static, part)
 
-    def _with_slots(self, model: mjx.Model, near: Slots) -> mjx.Model:
+    def _with_slots(self, model: mjx.Model, near: CollisionSlots) -> mjx.Model:
         n = len(near.pos)
         model = model.replace(
             geom_pos=model.geom_pos.at[:n].set(near.pos),
@@ -173,17 +173,17 @@ class MjxPhysics:
         return model.replace(_impl=model._impl.replace(mesh_convex=convex))
 
 
-def _slots(full: Template, geoms: np.ndarray) -> Slots:
+def _slots(full: Template, geoms: np.ndarray) -> CollisionSlots:
     fields = {name: value[:, geoms] for name, value in full.fields.items() if name.startswith("geom_")}
     box = fields["geom_dataid"] < 0
     centre, half = np.split(fields["geom_aabb"].reshape(*box.shape, 6), 2, -1)
     mat = np.asarray(rot.matrix_from_quat(jnp.asarray(fields["geom_quat"])))
     centre = fields["geom_pos"] + np.einsum("snij,snj->sni", mat, centre)
     arrays = (fields["geom_pos"], fields["geom_quat"], fields["geom_size"], fields["geom_dataid"], centre, half)
-    return Slots(*(jnp.asarray(a, jnp.int32 if a.dtype.kind == "i" else jnp.float32) for a in arrays))
+    return CollisionSlots(*(jnp.asarray(a, jnp.int32 if a.dtype.kind == "i" else jnp.float32) for a in arrays))
 
 
-def _nearest(slots: Slots, pos, mat, box_pos, box_mat, box_half, n: int) -> Slots:
+def _nearest(slots: CollisionSlots, pos, mat, box_pos, box_mat, box_half, n: int) -> CollisionSlots:
     """For each of K boxes the n nearest slots of a body, [K * n], by the widest gap along the six axes of both."""
     apart = box_pos - (pos + slots.centre @ mat.T)[:, None]  # [N, K, 3]
     mats = mat @ rot.matrix_from_quat(slots.quat)

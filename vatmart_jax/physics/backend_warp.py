@@ -63,7 +63,7 @@ class WarpPhysics:
         ctrl = jnp.asarray(ctrl, jnp.float32)
         diverged = state.diverged | (active & ~jnp.isfinite(ctrl).all((-2, -1)))
         active = active & ~diverged
-        warmstart = jax.lax.bitcast_convert_type(state.exact, jnp.float32)
+        warmstart = jax.lax.bitcast_convert_type(state.backend_state, jnp.float32)
         qpos, qvel, warmstart, contact, sound = self._step(
             state.scene, state.gripper_pose, state.qpos, state.qvel, warmstart, ctrl, active
         )
@@ -73,7 +73,7 @@ class WarpPhysics:
             qvel=jnp.where(good[:, None], qvel, state.qvel),
             in_contact=jnp.where(good, contact, state.in_contact),
             diverged=diverged | (active & ~sound),
-            exact=jnp.where(good[:, None], bits_of(warmstart), state.exact),
+            backend_state=jnp.where(good[:, None], bits_of(warmstart), state.backend_state),
         )
 
     def _contact(self, scene, *rest):

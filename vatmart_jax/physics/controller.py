@@ -25,7 +25,7 @@ def hand_target(move: jax.Array, euler: jax.Array, start: jax.Array, fingers: ja
 def waypoint_controls(previous: jax.Array, target: jax.Array, config: PhysicsConfig) -> jax.Array:
     """[B, 8] to [B, 8] -> [B, T, 8]: minimum jerk over the first share of the steps, then hold; fingers at once."""
     steps = config.steps_per_waypoint
-    moving = max(1, round(steps * config.move_share))
+    moving = max(1, round(steps * config.ramp_fraction))
     s = min_jerk(jnp.arange(1, steps + 1) / moving)[:, None]
     path = previous[:, None] + s * (target - previous)[:, None]
     return jnp.concatenate([path[..., :6], jnp.broadcast_to(target[:, None, 6:], (*path.shape[:2], 2))], -1)

@@ -36,7 +36,7 @@ class PhysicsConfig:
     """halving it changes the final joint value by under 1 mrad or 1 mm in the median"""
     steps_per_waypoint: int = 100
     """0.4 s; 0.6 s gives the same success of scripted pushes"""
-    move_share: float = 0.7
+    ramp_fraction: float = 0.7
     """min-jerk over this share of a waypoint, then hold: coasting dies within the hold"""
     iterations: int = 10
     """Newton converges in 5 with the pyramidal cone"""

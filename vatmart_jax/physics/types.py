@@ -26,11 +26,13 @@ class PhysicsState:
     qvel: jax.Array  # [B, 9]
     in_contact: jax.Array  # [B] bool, the gripper touches the object
     diverged: jax.Array  # [B] bool, MuJoCo warned or a number was not finite; the state stays the last good one
-    exact: jax.Array  # [B, n] uint32, what the implementation keeps beyond float32 (bits of float64), n may be 0
+    backend_state: (
+        jax.Array
+    )  # [B, n] uint32, what the implementation keeps beyond float32 (bits of float64), n may be 0
 
 
 def bits_of(x: jax.Array) -> jax.Array:
-    """float32 as `PhysicsState.exact` keeps it."""
+    """float32 as `PhysicsState.backend_state` keeps it."""
     return jax.lax.bitcast_convert_type(x, jnp.uint32)
 
 

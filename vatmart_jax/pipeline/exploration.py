@@ -10,91 +10,101 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 
-from vatmart_jax.envs.env import ACTION, OBSERVATION, Env, EnvState, Start, reward_terms
-from vatmart_jax.envs.scripted_policy import expert_action
+from vatmart_jax.envs.env import ACTION, OBSERVATION, Env, EnvState, TrialStart, reward_terms
+from vatmart_jax.envs.scripted_policy import scripted_action
 from vatmart_jax.errors import UserError
-from vatmart_jax.rl.replay_buffer import Episode, Replay, hindsight
+from vatmart_jax.rl.replay_buffer import Episode, ReplayBuffer, hindsight
 from vatmart_jax.rl.td3 import TD3, TD3Config, TD3State
 from vatmart_jax.trajectory import WAYPOINTS
 
 
 @dataclass(frozen=True)
-class ExploreConfig:
+class ExplorationConfig:
     """The RL stage."""
 
     td3: TD3Config = field(default_factory=TD3Config)
     iterations: int = 120
     """batches of trials"""
-    pool: int = 4096
+    start_pool_size: int = 4096
     """starts known to be free (and to grasp, when pulling) that trials begin at"""
     noise: tuple[float, float] = (0.2, 0.03)
     """exploration noise, share of the action range: first and last iteration, geometric between"""
-    random: float = 0.1
+    random_action_prob: float = 0.1
     """share of uniformly random actions, decaying as the noise does"""
-    warmup: int = 4
+    warmup_iters: int = 4
     """iterations before the policy acts: half of the trials take random actions, half are the scripted expert's"""
-    strain: float = 1000.0
-    """pulling: penalty per unit length that the hand is from where it was sent, see `Env.strain`; the paper has none"""
+    tracking_penalty: float = 1000.0
+    """pulling: penalty per unit length that the hand is from where it was sent, see `Env.tracking_error`; the
+    paper has none"""
     hindsight_low: float = 0.5
     """relabelled tasks reach down to this share of the smallest task"""
 
 
 @struct.dataclass
-class ExploreState:
+class ExplorationState:
     """What the RL stage carries between iterations; a pytree of arrays."""
 
     td3: TD3State
-    replay: Replay
+    replay: ReplayBuffer
     key: jax.Array
     iteration: jax.Array  # [] int32
 
 
-class Explorer:
+class ExplorationLoop:
     """TD3 with hindsight on one environment."""
 
-    def __init__(self, env: Env, config: ExploreConfig):
+    def __init__(self, env: Env, config: ExplorationConfig):
         self.env, self.config = env, config
         self.td3 = TD3(config.td3, OBSERVATION, ACTION)
-        self.iterate = jax.jit(self._iterate)
-        self.run = jax.jit(self._run, static_argnames="abandon")
+        self.train_iteration = jax.jit(self._train_iteration)
+        self.rollout = jax.jit(self._rollout, static_argnames="terminate_on_failure")
 
-    def init(self, key: jax.Array) -> ExploreState:
+    def init(self, key: jax.Array) -> ExplorationState:
         """Consumes the key."""
         kt, ks = jax.random.split(key)
-        replay = Replay.create(self.config.td3.capacity, OBSERVATION, ACTION)
-        return ExploreState(self.td3.init(kt), replay, ks, jnp.zeros((), jnp.int32))
+        replay = ReplayBuffer.create(self.config.td3.buffer_size, OBSERVATION, ACTION)
+        return ExplorationState(self.td3.init(kt), replay, ks, jnp.zeros((), jnp.int32))
 
-    def _run(
-        self, policy, pool: Start | None, key: jax.Array, noise, random, expert: Any = 0.0, abandon: bool = True
+    def _rollout(
+        self,
+        policy,
+        pool: TrialStart | None,
+        key: jax.Array,
+        noise,
+        random,
+        expert: Any = 0.0,
+        terminate_on_failure: bool = True,
     ) -> tuple[EnvState, Episode]:
         """One batch of trials; from the pool if there is one, else from random starts. Consumes the key.
 
         noise: share of the action range; random: share of uniform actions; expert: share of trials that the scripted
-        expert makes, with the same noise. Without `abandon` trials that cannot succeed are acted out too: perception
-        learns from them.
+        expert makes, with the same noise. Without `terminate_on_failure` trials that cannot succeed are acted out too:
+        perception learns from them.
         """
         kr, ke = jax.random.split(key)
         begun = self.env.reset(kr, pool)
-        if not abandon:
+        if not terminate_on_failure:
             begun = begun.replace(done=jnp.zeros_like(begun.done))
 
         def step(state: EnvState, key: jax.Array):
             kp, kx = jax.random.split(key)
             action = self.td3.explore(policy, state.obs, kp, noise, random)
-            shown = expert_action(self.env, state)
+            shown = scripted_action(self.env, state)
             shown = jnp.clip(shown + noise * jax.random.normal(kx, shown.shape), -1, 1)
             action = jnp.where(jnp.arange(len(action))[:, None] < expert * len(action), shown, action)
-            after = self.env.step(state, action, abandon)
-            cost = self.config.strain * self.env.task.opening * self.env.strain(after)
+            after = self.env.step(state, action, terminate_on_failure)
+            cost = self.config.tracking_penalty * self.env.task.opening * self.env.tracking_error(after)
             record = Episode(
                 state.obs, action, after.reward - cost, after.obs, after.done, ~state.done & ~after.physics.diverged,
-                state.moved, after.moved, after.info["tip_distance"], after.held, cost,
+                state.displacement, after.displacement, after.info["tip_distance"], after.grasp_held, cost,
             )  # fmt: skip
             return after, record
 
         return jax.lax.scan(step, begun, jax.random.split(ke, WAYPOINTS))
 
-    def _iterate(self, state: ExploreState, pool: Start, curiosity) -> tuple[ExploreState, EnvState, dict]:
+    def _train_iteration(
+        self, state: ExplorationState, pool: TrialStart, curiosity
+    ) -> tuple[ExplorationState, EnvState, dict]:
         """Trials, storing, hindsight, updates.
 
         curiosity: None, or a function of the final EnvState that returns a penalty [B] for successful trajectories
@@ -105,10 +115,10 @@ class Explorer:
         progress = jnp.minimum(state.iteration / max(1, config.iterations - 1), 1.0)
         first, last = config.noise
         decay = (last / first) ** progress
-        warm = state.iteration < config.warmup
-        random = jnp.where(warm, 1.0, config.random * decay)
+        warm = state.iteration < config.warmup_iters
+        random = jnp.where(warm, 1.0, config.random_action_prob * decay)
         expert = jnp.where(warm, 0.5, 0.0)
-        final, episode = self._run(state.td3.policy, pool, kr, first * decay, random, expert)
+        final, episode = self._rollout(state.td3.policy, pool, kr, first * decay, random, expert)
         penalty = jnp.zeros_like(final.reward) if curiosity is None else curiosity(final)
         ended = episode.active & episode.done & final.success
         episode = episode.replace(reward=episode.reward - penalty * ended)
@@ -127,21 +137,21 @@ class Explorer:
             "curiosity": (penalty * final.success).sum() / jnp.maximum(final.success.sum(), 1),
             **losses,
         }
-        return ExploreState(td3, replay, key, state.iteration + 1), final, metrics
+        return ExplorationState(td3, replay, key, state.iteration + 1), final, metrics
 
 
-def start_pool(env: Env, key: jax.Array, size: int, progress: Callable[[int], None] = lambda done: None) -> Start:
+def start_pool(env: Env, key: jax.Array, size: int, progress: Callable[[int], None] = lambda done: None) -> TrialStart:
     """`size` starts that are free, grasp when pulling, and leave the longest task's way free. Consumes the key.
 
     Raises UserError where fewer than one in two hundred random starts will do: the data does not fit the task.
     """
 
     @jax.jit
-    def attempt(key: jax.Array) -> tuple[Start, jax.Array]:
+    def attempt(key: jax.Array) -> tuple[TrialStart, jax.Array]:
         state = env.reset(key)
-        return state.start, state.valid & env.leaves_way(state.start)
+        return state.start, state.valid & env.path_is_free(state.start)
 
-    kept: list[Start] = []
+    kept: list[TrialStart] = []
     found = tried = 0
     while found < size:
         key, sub = jax.random.split(key)
@@ -151,7 +161,7 @@ def start_pool(env: Env, key: jax.Array, size: int, progress: Callable[[int], No
         found += len(good)
         tried += len(start.view)
         progress(min(found, size))
-        if tried >= 20 * env.config.batch and found < tried / 200:
+        if tried >= 20 * env.config.num_envs and found < tried / 200:
             raise UserError(
                 f"only {found} of {tried} random starts of task {env.task.name} are free, hold and have a free way: "
                 "the objects do not fit the gripper; look at the conversion's report"

@@ -12,14 +12,14 @@ import jax.numpy as jnp
 import orbax.checkpoint as ocp
 
 from vatmart_jax.atomic_io import write_json, write_text
-from vatmart_jax.errors import UserError, first_line
+from vatmart_jax.errors import UserError, summarize_error
 
 
 class RunError(UserError):
     """A run folder cannot be used."""
 
 
-class Run:
+class RunDir:
     """One run folder.
 
     config.json       the resolved config; a folder that holds another one is refused
@@ -67,7 +67,7 @@ class Run:
             try:
                 found = self._checkpoints.restore(step, args=ocp.args.StandardRestore(like))
             except (ValueError, KeyError, OSError, TypeError) as e:
-                problems[step] = first_line(e)[:120]
+                problems[step] = summarize_error(e)[:120]
                 continue
             for damaged in problems:
                 self._checkpoints.delete(damaged)
@@ -81,7 +81,7 @@ class Run:
         self._truncate(0)
         return state
 
-    def __enter__(self) -> Run:
+    def __enter__(self) -> RunDir:
         return self
 
     def __exit__(self, *_: object) -> None:

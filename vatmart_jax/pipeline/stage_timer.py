@@ -24,22 +24,22 @@ def _compilations() -> list[float]:
     return seconds
 
 
-class Lap(NamedTuple):
+class StageTime(NamedTuple):
     """Seconds."""
 
     working: float
     compiling: float
 
 
-class Clock:
+class StageTimer:
     """Runs from its making on."""
 
     def __init__(self) -> None:
         self._begun, self._compiled = time.monotonic(), len(_compilations())
 
-    def lap(self) -> Lap:
+    def lap(self) -> StageTime:
         """The time since the last lap."""
         now, compilations = time.monotonic(), _compilations()
         wall, compiling = now - self._begun, sum(compilations[self._compiled :])
         self._begun, self._compiled = now, len(compilations)
-        return Lap(max(0.0, wall - compiling), compiling)
+        return StageTime(max(0.0, wall - compiling), compiling)

@@ -9,9 +9,9 @@ import jax
 import jax.numpy as jnp
 from jax import export as jax_export
 
-from vatmart_jax.atomic_io import whole_folder, write_json
+from vatmart_jax.atomic_io import atomic_directory, write_json
 from vatmart_jax.config import to_json
-from vatmart_jax.errors import at_least_one, one_of
+from vatmart_jax.errors import require_one_of, require_positive
 from vatmart_jax.priors.priors import Priors, predict
 
 FORMATS = ("flax", "stablehlo")
@@ -26,8 +26,8 @@ def export(priors: Priors, out: Path | str, formats: Sequence[str] = FORMATS, n_
     comes out. Raises UserError for an unknown format or no proposals, before anything is written.
     """
     for name in formats:
-        one_of("--format", name, FORMATS)
-    at_least_one("--proposals", n_proposals)
+        require_one_of("--format", name, FORMATS)
+    require_positive("--proposals", n_proposals)
     out = Path(out)
     for name in formats:
         if name == "flax":
@@ -38,10 +38,10 @@ def export(priors: Priors, out: Path | str, formats: Sequence[str] = FORMATS, n_
 
 
 def _save_stablehlo(priors: Priors, folder: Path, n_proposals: int) -> None:
-    n = priors.config.networks.pointnet.n_points
+    n = priors.config.networks.encoder.n_points
 
     def function(points: jax.Array, part_mask: jax.Array, task: jax.Array, seed: jax.Array) -> tuple[jax.Array, ...]:
-        return predict(priors.ensemble, priors.params, points, part_mask, task, jax.random.key(seed), n_proposals)
+        return predict(priors.predictor, priors.params, points, part_mask, task, jax.random.key(seed), n_proposals)
 
     inputs = {
         "points": jax.ShapeDtypeStruct((n, 3), jnp.float32),
@@ -52,8 +52,8 @@ def _save_stablehlo(priors: Priors, folder: Path, n_proposals: int) -> None:
     exported = jax_export.export(jax.jit(function), platforms=PLATFORMS)(*inputs.values())
     names = ("contact_index", "actionability", "trajectories", "scores")
     outputs = dict(zip(names, exported.out_avals, strict=True))
-    describe = lambda of: {k: {"shape": list(v.shape), "dtype": v.dtype.name} for k, v in of.items()}  # noqa: E731
+    describe = lambda of: {k: {"shape": list(v.shape), "dtype": v.dtype.name} for k, v in of.items()}
     signature = {"inputs": describe(inputs), "outputs": describe(outputs), "platforms": list(PLATFORMS)}
-    with whole_folder(folder) as part:
+    with atomic_directory(folder) as part:
         (part / "priors.bin").write_bytes(exported.serialize())
         write_json(part / "signature.json", signature | to_json(priors.config))

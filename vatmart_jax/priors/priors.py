@@ -21,15 +21,16 @@ import numpy as np
 import trimesh
 from flax import serialization
 
-from vatmart_jax.atomic_io import whole, whole_folder, write_json
+from vatmart_jax.atomic_io import atomic_directory, atomic_write, write_json
 from vatmart_jax.config import from_json, to_json
-from vatmart_jax.errors import UserError, at_least_one, first_line
+from vatmart_jax.errors import UserError, require_positive, summarize_error
+from vatmart_jax.perception import format_1
 from vatmart_jax.perception.networks import Features, Networks, NetworksConfig, Params
 from vatmart_jax.perception.pointnet2 import group
-from vatmart_jax.perception.predictor import Ensemble
+from vatmart_jax.perception.predictor import TTAPredictor
 
-FORMAT = 1
-MOST_COPIES = 64  # of a view: a config is untrusted, and memory grows with them
+FORMAT = 2
+MAX_AUGMENTATIONS = 64  # of a view: a config is untrusted, and memory grows with them
 
 
 class PriorsError(UserError):
@@ -47,12 +48,12 @@ class PriorsConfig:
     high: float
     """largest amount"""
     networks: NetworksConfig = field(default_factory=NetworksConfig)
-    copies: int = 1
+    num_augmentations: int = 1
     """of a view, mirrored and turned, that the networks are asked about; 1: the view alone"""
 
     def __post_init__(self) -> None:
-        if not 1 <= self.copies <= MOST_COPIES:
-            raise UserError(f"copies {self.copies}: expected 1 to {MOST_COPIES}")
+        if not 1 <= self.num_augmentations <= MAX_AUGMENTATIONS:
+            raise UserError(f"num_augmentations {self.num_augmentations}: expected 1 to {MAX_AUGMENTATIONS}")
 
 
 class Prediction(NamedTuple):
@@ -66,7 +67,7 @@ class Prediction(NamedTuple):
 
     def save(self, path: Path | str) -> None:
         """Write one .npz file with these fields, complete or not at all."""
-        with whole(path) as part, part.open("wb") as f:
+        with atomic_write(path) as part, part.open("wb") as f:
             np.savez(f, **self._asdict())
 
 
@@ -78,13 +79,13 @@ class Priors:
     params: Params
 
     @property
-    def ensemble(self) -> Ensemble:
+    def predictor(self) -> TTAPredictor:
         """The networks as they are to be asked."""
-        return Ensemble(Networks(self.config.networks), self.config.copies)
+        return TTAPredictor(Networks(self.config.networks), self.config.num_augmentations)
 
     def save(self, path: Path | str) -> None:
         """Write the folder, complete or not at all; one that is there is replaced."""
-        with whole_folder(path) as part:
+        with atomic_directory(path) as part:
             (part / "params.msgpack").write_bytes(serialization.msgpack_serialize(jax.device_get(self.params)))
             write_json(part / "config.json", {"format": FORMAT, **to_json(self.config)})
 
@@ -96,12 +97,14 @@ class Priors:
         """
         path = Path(path)
         path = path / "priors" if (path / "priors").is_dir() else path
-        config = _read_config(path / "config.json")
+        config, written = _read_config(path / "config.json")
         file = path / "params.msgpack"
         try:
             params: Any = serialization.msgpack_restore(file.read_bytes())
         except Exception as e:  # whatever msgpack and NumPy raise on damaged bytes
-            raise PriorsError(f"{file}: cannot be read ({first_line(e)}); train or export the priors again") from e
+            raise PriorsError(f"{file}: cannot be read ({summarize_error(e)}); train or export the priors again") from e
+        if written == 1:
+            params = format_1.parameters(params)
         expected = jax.eval_shape(Networks(config.networks).init, jax.random.key(0))
         wrong = _difference(expected, params)
         if wrong:
@@ -123,7 +126,7 @@ class Priors:
         where the cloud has more than they were trained with, and the proposals' randomness; consumed. Raises
         UserError for input that does not fit.
         """
-        at_least_one("--proposals", n_proposals)
+        require_positive("--proposals", n_proposals)
         points = np.asarray(points, np.float32)
         if points.ndim != 2 or points.shape[1] != 3 or not len(points) or not np.isfinite(points).all():
             raise PriorsError(f"points: expected finite [N, 3] coordinates, found shape {points.shape}")
@@ -133,16 +136,16 @@ class Priors:
         if mask.shape != (len(points),) or not mask.any():
             raise PriorsError(f"part_mask: expected {len(points)} booleans, one of them true at least")
         found = predict(
-            self.ensemble, self.params, points, mask, jnp.float32(task), jax.random.key(0) if key is None else key,
+            self.predictor, self.params, points, mask, jnp.float32(task), jax.random.key(0) if key is None else key,
             n_proposals,
         )  # fmt: skip
         index, *rest = jax.device_get(found)
         return Prediction(int(index), points[int(index)], *rest)
 
 
-@partial(jax.jit, static_argnames=("ensemble", "n_proposals"))
+@partial(jax.jit, static_argnames=("predictor", "n_proposals"))
 def predict(
-    ensemble: Ensemble,
+    predictor: TTAPredictor,
     params: Params,
     points: jax.Array | np.ndarray,
     part_mask: jax.Array | np.ndarray,
@@ -156,15 +159,15 @@ def predict(
     """
     k_points, k_proposals = jax.random.split(key)
     points = jnp.asarray(points)
-    pointnet = ensemble.networks.config.pointnet
+    encoder = predictor.networks.config.encoder
     # Random order for the ball queries, and the number of points that training saw; a smaller cloud repeats.
     order = jax.random.permutation(k_points, len(points))
-    seen = points[jnp.resize(order, (pointnet.n_points,))]
-    f = ensemble.features(params, seen, group(seen, points, pointnet))
-    actionability = ensemble.actionability(params, f, points, task)
+    seen = points[jnp.resize(order, (encoder.n_points,))]
+    f = predictor.features(params, seen, group(seen, points, encoder))
+    actionability = predictor.actionability(params, f, points, task)
     contact = jnp.argmax(jnp.where(part_mask, actionability, -1))
     at = Features(*(x[:, contact] for x in f))
-    trajectories, scores = ensemble.propose(params, at, points[contact], task, k_proposals, n_proposals)
+    trajectories, scores = predictor.propose(params, at, points[contact], task, k_proposals, n_proposals)
     best = jnp.argsort(-scores)
     return contact, actionability, trajectories[best], scores[best]
 
@@ -183,7 +186,7 @@ def read_cloud(path: Path) -> np.ndarray:
     except FileNotFoundError:
         raise PriorsError(f"{path}: no such file") from None
     except Exception as e:  # whatever the readers raise on damaged bytes
-        raise PriorsError(f"{path}: cannot be read ({first_line(e)})") from e
+        raise PriorsError(f"{path}: cannot be read ({summarize_error(e)})") from e
     if points.dtype.kind not in "fiu" or points.ndim != 2 or points.shape[1] != 3 or not len(points):
         raise PriorsError(f"{path}: expected numbers [N, 3], found {points.dtype} {points.shape}")
     points = points.astype(np.float32)
@@ -197,7 +200,7 @@ def read_mask(path: Path, count: int) -> np.ndarray:
     try:
         mask = np.load(path, allow_pickle=False)
     except (OSError, EOFError, ValueError) as e:
-        raise PriorsError(f"{path}: cannot be read ({first_line(e)}); expected a .npy file of booleans") from e
+        raise PriorsError(f"{path}: cannot be read ({summarize_error(e)}); expected a .npy file of booleans") from e
     if mask.shape != (count,) or mask.dtype.kind not in "bui" or not mask.any():
         raise PriorsError(
             f"{path}: expected {count} booleans, one of them true at least; found {mask.dtype} {mask.shape}"
@@ -222,23 +225,28 @@ def amount(text: str, task: str) -> float:
     return math.radians(value) if unit == "deg" else value
 
 
-def _read_config(path: Path) -> PriorsConfig:
+def _read_config(path: Path) -> tuple[PriorsConfig, int]:
+    """The config, and the number of the format it was written in."""
     if not path.is_file():
         raise PriorsError(f"{path}: no such file; expected a folder of priors such as RUN/priors of `vatmart train`")
     try:
         found = json.loads(path.read_text())
-        if not isinstance(found, dict) or found.pop("format", None) != FORMAT:
+        written = found.pop("format", None) if isinstance(found, dict) else None
+        if written not in (1, FORMAT):
             raise ValueError(f"not of format {FORMAT}")
-        return from_json(PriorsConfig, found)
-    except (OSError, ValueError, TypeError) as e:
-        raise PriorsError(f"{path}: not a config of priors ({first_line(e)}); train or export them again") from e
+        if written == 1:
+            found = format_1.renamed(found, {"copies": "num_augmentations"})
+            found["networks"] = format_1.networks_config(found["networks"])
+        return from_json(PriorsConfig, found), written
+    except (OSError, ValueError, TypeError, KeyError, AttributeError) as e:
+        raise PriorsError(f"{path}: not a config of priors ({summarize_error(e)}); train or export them again") from e
 
 
 def _difference(expected: Any, found: Any) -> str:
     """What is wrong with the parameters, or nothing."""
     if not isinstance(found, dict):
         return "holds no parameters"
-    flat = lambda tree: {jax.tree_util.keystr(k): v for k, v in jax.tree_util.tree_leaves_with_path(tree)}  # noqa: E731
+    flat = lambda tree: {jax.tree_util.keystr(k): v for k, v in jax.tree_util.tree_leaves_with_path(tree)}
     expected, found = flat(expected), flat(found)
     for name in sorted(expected.keys() ^ found.keys()):
         return f"parameter {name} is {'missing' if name in expected else 'unknown'}"

@@ -21,14 +21,14 @@ class Transition:
 
 
 @struct.dataclass
-class Replay:
+class ReplayBuffer:
     """A ring of the last `capacity` steps."""
 
     data: Transition  # [capacity, ...]
     inserted: jax.Array  # [] int32, ever
 
     @classmethod
-    def create(cls, capacity: int, observation: int, action: int) -> Replay:
+    def create(cls, capacity: int, observation: int, action: int) -> ReplayBuffer:
         zeros = jnp.zeros
         data = Transition(
             zeros((capacity, observation)), zeros((capacity, action)), zeros(capacity),
@@ -40,14 +40,14 @@ class Replay:
     def capacity(self) -> int:
         return self.data.reward.shape[0]
 
-    def insert(self, steps: Transition, keep: jax.Array) -> Replay:
+    def insert(self, steps: Transition, keep: jax.Array) -> ReplayBuffer:
         """Store the steps with keep [N] true; where they exceed the capacity, the last ones stay."""
         order = jnp.cumsum(keep) - 1
         count = jnp.sum(keep)
         stored = keep & (order >= count - self.capacity)
         rows = jnp.where(stored, (self.inserted + order) % self.capacity, self.capacity)
         data = jax.tree.map(lambda ring, new: ring.at[rows].set(new, mode="drop"), self.data, steps)
-        return Replay(data, self.inserted + count)
+        return ReplayBuffer(data, self.inserted + count)
 
     def sample(self, key: jax.Array, n: int) -> Transition:
         """n steps, uniform with replacement. Consumes the key."""
@@ -69,7 +69,7 @@ class Episode:
     before: jax.Array  # [K, B] how far the part had moved before the step
     after: jax.Array  # [K, B] and after it
     distance: jax.Array  # [K, B] fingertips to contact, after the step
-    held: jax.Array  # [K, B] bool, after the step
+    grasp_held: jax.Array  # [K, B] bool, after the step
     cost: jax.Array  # [K, B] taken off the reward, whatever the task
 
     def transitions(self) -> tuple[Transition, jax.Array]:
@@ -97,18 +97,18 @@ def hindsight(
     ahead = jnp.floor(jax.random.uniform(key, (steps, batch)) * left).astype(jnp.int32)
     future = jnp.minimum(jnp.arange(steps)[:, None] + ahead, steps - 1)
     goal = jnp.take_along_axis(episode.after, future, 0)
-    keep = episode.active & episode.held & (goal >= goals[0]) & (goal <= goals[1]) & (episode.before < goal)
-    success = (jnp.abs(goal - episode.after) <= tolerance * goal) & episode.held
+    keep = episode.active & episode.grasp_held & (goal >= goals[0]) & (goal <= goals[1]) & (episode.before < goal)
+    success = (jnp.abs(goal - episode.after) <= tolerance * goal) & episode.grasp_held
     terms = reward(goal, episode.before, episode.after, episode.distance, success)
     total = sum(terms.values()) - episode.cost - curiosity * success
-    relabel = lambda obs, moved: obs.at[..., 1].set(goal).at[..., 2].set(goal - moved)  # noqa: E731
+    relabel = lambda obs, moved: obs.at[..., 1].set(goal).at[..., 2].set(goal - moved)
     last = jnp.arange(steps)[:, None] == steps - 1
     copies = Transition(
         relabel(episode.obs, episode.before),
         episode.action,
         total,
         relabel(episode.next_obs, episode.after),
-        (success | last | ~episode.held).astype(jnp.float32),
+        (success | last | ~episode.grasp_held).astype(jnp.float32),
     )
     return jax.tree.map(_flat, copies), _flat(keep)
 

@@ -11,7 +11,7 @@ import optax
 from flax import struct
 
 from vatmart_jax.rl.networks import Critic, Policy
-from vatmart_jax.rl.replay_buffer import Replay, Transition
+from vatmart_jax.rl.replay_buffer import ReplayBuffer, Transition
 
 
 @dataclass(frozen=True)
@@ -19,20 +19,20 @@ class TD3Config:
     """Defaults found by measuring (docs/learning.md); the `paper` preset has the paper's."""
 
     hidden: int = 512
-    batch: int = 256
+    batch_size: int = 256
     learning_rate: float = 3e-4
     discount: float = 0.9
-    polyak: float = 0.01
+    tau: float = 0.01
     policy_delay: int = 2
     target_noise: float = 0.1
     target_noise_clip: float = 0.2
     reward_scale: float = 0.01
     """rewards of hundreds make values of hundreds, which Adam reaches slowly"""
-    saturation: float = 0.01
+    pre_tanh_l2: float = 0.01
     """penalty for the squares of what actions are the tanh of: where that is large, no gradient comes back and the
     policy is stuck for good; the paper has 0"""
-    capacity: int = 100_000
-    updates: int = 64
+    buffer_size: int = 100_000
+    grad_steps_per_iter: int = 64
     """gradient steps per batch of trials"""
 
 
@@ -82,21 +82,21 @@ class TD3:
         uniform = jax.random.uniform(ku, action.shape, minval=-1.0)
         return jnp.where(jax.random.uniform(kr, (len(obs), 1)) < random, uniform, action)
 
-    def learn(self, state: TD3State, replay: Replay, key: jax.Array) -> tuple[TD3State, dict[str, jax.Array]]:
+    def learn(self, state: TD3State, replay: ReplayBuffer, key: jax.Array) -> tuple[TD3State, dict[str, jax.Array]]:
         """`updates` gradient steps on the critics, one in `policy_delay` on the policy too. Consumes the key."""
 
         def update(state, key):
             ks, kn = jax.random.split(key)
-            return self._update(state, replay.sample(ks, self.config.batch), kn)
+            return self._update(state, replay.sample(ks, self.config.batch_size), kn)
 
-        state, metrics = jax.lax.scan(update, state, jax.random.split(key, self.config.updates))
+        state, metrics = jax.lax.scan(update, state, jax.random.split(key, self.config.grad_steps_per_iter))
         return state, jax.tree.map(jnp.mean, metrics)
 
     def _value(self, critic: Any, obs: jax.Array, action: jax.Array) -> jax.Array:
         return self._critic.apply(critic, obs, action)  # pyright: ignore[reportReturnType]
 
     def _values(self, critics: Any, obs: jax.Array, action: jax.Array) -> jax.Array:
-        value = lambda critic: self._value(critic, obs, action)  # noqa: E731
+        value = lambda critic: self._value(critic, obs, action)
         return jax.vmap(value)(critics)
 
     def _update(self, state: TD3State, steps: Transition, key: jax.Array):
@@ -121,12 +121,12 @@ class TD3:
             def policy_loss(policy):
                 raw = self._raw(policy, steps.obs)
                 value = self._value(first, steps.obs, jnp.tanh(raw))
-                return config.saturation * jnp.mean(raw**2) - jnp.mean(value)
+                return config.pre_tanh_l2 * jnp.mean(raw**2) - jnp.mean(value)
 
             grads = jax.grad(policy_loss)(state.policy)
             changes, policy_opt = self._optimizer.update(grads, state.policy_opt)
             policy = optax.apply_updates(state.policy, changes)
-            follow = lambda target, new: optax.incremental_update(new, target, config.polyak)  # noqa: E731
+            follow = lambda target, new: optax.incremental_update(new, target, config.tau)
             return state.replace(
                 policy=policy,
                 policy_opt=policy_opt,

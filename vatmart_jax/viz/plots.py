@@ -11,8 +11,8 @@ import matplotlib
 import numpy as np
 
 from vatmart_jax import rotations as rot
-from vatmart_jax.atomic_io import whole
-from vatmart_jax.trajectory import since_start, unpack_trajectory
+from vatmart_jax.atomic_io import atomic_write
+from vatmart_jax.trajectory import cumulative_residuals, unpack_trajectory
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
@@ -20,9 +20,9 @@ from matplotlib import patheffects
 
 _STAGE_CURVES = (
     ("explore", ("success", "reward")),
-    ("course", ("course_error",)),
+    ("flow", ("flow_error",)),
     ("scorer", ("score_loss",)),
-    ("proposal", ("move_loss", "turn_loss", "rotation_loss", "kl_loss")),
+    ("proposal", ("position_loss", "euler_loss", "rotation_loss", "kl_loss")),
     ("actionability", ("actionability_loss", "actionability_target")),
     ("curiosity", ("success", "novel", "curiosity")),
     ("finetune", ("success", "score_loss")),
@@ -96,7 +96,7 @@ def priors(
     with decreasing weight; scores: [P]; camera: azimuth and elevation (rad) as ViewBank has them.
     """
     right, upward, toward = _camera(*camera)
-    project = lambda p: np.stack([p @ right, p @ upward], -1)  # noqa: E731
+    project = lambda p: np.stack([p @ right, p @ upward], -1)
     figure, axis = plt.subplots(figsize=(6.4, 5.4))
     order = np.argsort(points @ toward)
     points, part_mask, actionability = points[order], part_mask[order], actionability[order]
@@ -128,7 +128,7 @@ def priors(
 def waypoints(trajectory: np.ndarray, contact: np.ndarray, standoff: float) -> tuple[np.ndarray, np.ndarray]:
     """Commanded fingertip positions [5, 3] and hand frames [5, 3, 3], object frame, of one trajectory [30]."""
     start, _ = unpack_trajectory(jnp.asarray(trajectory))
-    total = jnp.concatenate([jnp.zeros((1, 6)), since_start(jnp.asarray(trajectory))])
+    total = jnp.concatenate([jnp.zeros((1, 6)), cumulative_residuals(jnp.asarray(trajectory))])
     frames = start @ rot.matrix_from_euler(total[:, 3:])
     tips = contact - standoff * np.asarray(start[:, 2]) + np.asarray(total[:, :3])
     return tips, np.asarray(frames)
@@ -145,7 +145,7 @@ def _camera(azimuth: float, elevation: float) -> tuple[np.ndarray, np.ndarray, n
 
 def _save(figure, out: Path) -> None:
     try:
-        with whole(out) as part:
+        with atomic_write(out) as part:
             figure.savefig(part, dpi=110, bbox_inches="tight", format="png")
     finally:
         plt.close(figure)

@@ -16,11 +16,11 @@ import mujoco
 import numpy as np
 from jax.experimental import io_callback
 
-from vatmart_jax.atomic_io import whole
+from vatmart_jax.atomic_io import atomic_write
 from vatmart_jax.data.banks import HINGE, SceneBank, ViewBank
-from vatmart_jax.envs.env import TASKS, Env, EnvConfig, EnvState, Start, Task
-from vatmart_jax.envs.scripted_policy import run_expert
-from vatmart_jax.errors import OpenGLError, UserError, first_line, one_of
+from vatmart_jax.envs.env import TASKS, Env, EnvConfig, EnvState, Task, TrialStart
+from vatmart_jax.envs.scripted_policy import run_scripted_policy
+from vatmart_jax.errors import OpenGLError, UserError, require_one_of, summarize_error
 from vatmart_jax.physics import Physics, PhysicsState
 from vatmart_jax.physics.scene_model import scene_model
 from vatmart_jax.priors.priors import Priors
@@ -57,7 +57,7 @@ class _Recorder:
 
     def rollout(self, state: PhysicsState, ctrl: jax.Array, active: jax.Array) -> PhysicsState:
         pieces = ctrl.reshape(len(ctrl), -1, EVERY, ctrl.shape[-1]).swapaxes(0, 1)
-        run = lambda state, piece: (self._keep(self._physics.rollout(state, piece, active)), None)  # noqa: E731
+        run = lambda state, piece: (self._keep(self._physics.rollout(state, piece, active)), None)
         return jax.lax.scan(run, state, pieces)[0]
 
     def _keep(self, state: PhysicsState) -> PhysicsState:
@@ -85,17 +85,17 @@ def play(
     kind = "door" if bank.joint_type[chosen[0]] == HINGE else "drawer"
     priors = Priors.load(run) if run else None
     name = task or (priors.config.task if priors else f"push-{kind}")
-    one_of("--task", name, TASKS)
-    env = Env(bank.select(chosen), views.of_scenes(chosen), TASKS[name], "c", EnvConfig(batch=TRIES))
+    require_one_of("--task", name, TASKS)
+    env = Env(bank.select(chosen), views.of_scenes(chosen), TASKS[name], "c", EnvConfig(num_envs=TRIES))
     start = jax.jit(lambda key: env.sample(key, TRIES))(jax.random.key(seed))
     if amount is not None:
-        start = start.replace(task=jnp.full((TRIES,), _amount(amount, env.task)))
+        start = start.replace(goal=jnp.full((TRIES,), _amount(amount, env.task)))
     if priors is not None:
         start, numbers = _proposed(env, priors, start, seed)
     elif trajectory is not None:
         start, numbers = _given(env, start, trajectory, contact)
     else:
-        final = run_expert(env, start, jax.random.key(seed + 1))
+        final = run_scripted_policy(env, start, jax.random.key(seed + 1))
         best = int(np.argmax(np.asarray(final.valid) + 2 * np.asarray(final.success)))
         start, numbers = jax.tree.map(lambda x: x[best : best + 1], (final.start, final.trajectory))
     recording = record(env, start, numbers)
@@ -104,11 +104,11 @@ def play(
         "object": str(env.bank.object_id[0]),
         "part": str(env.bank.part[0]),
         "task": name,
-        "amount": round(float(end.start.task[0]), 4),
-        "moved": round(float(end.moved[0]), 4),
+        "amount": round(float(end.start.goal[0]), 4),
+        "moved": round(float(end.displacement[0]), 4),
         "success": bool(end.success[0]),
         "start_in_collision": bool(end.in_collision[0]),
-        "held": bool(end.held[0]),
+        "held": bool(end.grasp_held[0]),
         "frames": len(recording.qpos),
     }
 
@@ -119,22 +119,24 @@ def _amount(amount: float, task: Task) -> float:
     return amount
 
 
-def _proposed(env: Env, priors: Priors, start: Start, seed: int) -> tuple[Start, jax.Array]:
+def _proposed(env: Env, priors: Priors, start: TrialStart, seed: int) -> tuple[TrialStart, jax.Array]:
     """What the priors think best for the first of `start`'s views and tasks."""
     if priors.config.task != env.task.name:
         raise UserError(f"--run: its priors are of {priors.config.task}, not of {env.task.name}")
     view = int(start.view[0])
     cloud, mask = env.views.points[view].astype(np.float32), env.views.part_mask[view]
-    found = priors.predict(cloud, float(start.task[0]), mask, jax.random.key(seed))
+    found = priors.predict(cloud, float(start.goal[0]), mask, jax.random.key(seed))
     return _at(env, jax.tree.map(lambda x: x[:1], start), found.contact), jnp.asarray(found.trajectories[:1])
 
 
-def _given(env: Env, start: Start, file: Path, contact: tuple[float, float, float] | None) -> tuple[Start, jax.Array]:
+def _given(
+    env: Env, start: TrialStart, file: Path, contact: tuple[float, float, float] | None
+) -> tuple[TrialStart, jax.Array]:
     """The trajectory of a file, at a contact point or at the one of the first of `start`."""
     try:
         numbers = np.load(file, allow_pickle=False)
     except (OSError, ValueError, EOFError) as e:
-        raise UserError(f"{file}: not a .npy file ({first_line(e)}); give {TRAJECTORY} numbers") from e
+        raise UserError(f"{file}: not a .npy file ({summarize_error(e)}); give {TRAJECTORY} numbers") from e
     if not isinstance(numbers, np.ndarray) or numbers.shape != (TRAJECTORY,) or numbers.dtype.kind not in "fiu":
         found = f"shape {numbers.shape}" if isinstance(numbers, np.ndarray) else "an archive"
         raise UserError(f"{file}: expected {TRAJECTORY} numbers, found {found}; see geometry.pack_trajectory")
@@ -144,7 +146,7 @@ def _given(env: Env, start: Start, file: Path, contact: tuple[float, float, floa
     return (_at(env, start, contact) if contact else start), jnp.asarray(numbers[None], jnp.float32)
 
 
-def _at(env: Env, start: Start, contact) -> Start:
+def _at(env: Env, start: TrialStart, contact) -> TrialStart:
     """`start` at that contact of its view which is nearest to a point."""
     distance = np.linalg.norm(env.views.contacts[int(start.view[0])] - np.asarray(contact), axis=-1)
     return start.replace(contact=jnp.array([distance.argmin()], jnp.int32))
@@ -163,7 +165,7 @@ def find_scene(bank: SceneBank, name: str) -> int:
     raise UserError(f"SCENE {name}: not in the data; give {wanted}")
 
 
-def record(env: Env, start: Start, trajectory: jax.Array) -> Recording:
+def record(env: Env, start: TrialStart, trajectory: jax.Array) -> Recording:
     """Run one trial ([1] each) frame by frame: what `env.execute` does, in plain MuJoCo."""
     physics = env.physics
     env.physics = recorder = _Recorder(physics)
@@ -190,7 +192,7 @@ def animate(recording: Recording, path: Path, size: tuple[int, int] = SIZE) -> N
     from PIL import Image
 
     images = [Image.fromarray(pixels).quantize(96) for pixels in _rendered(recording, size)]
-    with whole(path) as part:
+    with atomic_write(path) as part:
         images[0].save(
             part, format="GIF", save_all=True, append_images=images[1:], duration=FRAME_MS, loop=0, optimize=True
         )

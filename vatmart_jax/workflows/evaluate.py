@@ -12,19 +12,19 @@ import numpy as np
 from flax import serialization
 
 from vatmart_jax.atomic_io import write_json, write_text
-from vatmart_jax.config import from_json
 from vatmart_jax.data.dataset import SPLITS, Data, DataError
 from vatmart_jax.envs.env import TASKS, Env
-from vatmart_jax.envs.scripted_policy import run_expert
-from vatmart_jax.errors import UserError, at_least_one, first_line, one_of
+from vatmart_jax.envs.scripted_policy import run_scripted_policy
+from vatmart_jax.errors import UserError, require_one_of, require_positive, summarize_error
 from vatmart_jax.evaluation.metrics import wilson_interval
 from vatmart_jax.evaluation.priors_metrics import labelled, priors_metrics
 from vatmart_jax.evaluation.success import Method, downstream, random_method
-from vatmart_jax.perception.grouped_views import clouds_of
+from vatmart_jax.perception.grouped_views import group_views
 from vatmart_jax.physics.types import IMPLS
-from vatmart_jax.pipeline.exploration import Explorer, start_pool
+from vatmart_jax.pipeline.exploration import ExplorationLoop, start_pool
 from vatmart_jax.pipeline.presets import Settings
 from vatmart_jax.pipeline.proposal_rollouts import ProposalTrials
+from vatmart_jax.pipeline.run_config import settings_of
 from vatmart_jax.pipeline.run_dir import read_config
 from vatmart_jax.priors.pretrained import run_folder
 from vatmart_jax.priors.priors import Priors
@@ -57,9 +57,9 @@ def evaluate(
     """
     for flag, given, known in (("--metrics", metrics, METRICS), ("--methods", methods, METHODS)):
         for name in given:
-            one_of(flag, name, known)
-    one_of("--impl", impl, IMPLS)
-    at_least_one("--trials", trials)
+            require_one_of(flag, name, known)
+    require_one_of("--impl", impl, IMPLS)
+    require_positive("--trials", trials)
     begun = time.monotonic()
     evaluated = []
     for given in runs:
@@ -79,7 +79,7 @@ def _evaluate_run(given, prepared, data, metrics, methods, trials, impl, seed, r
     config = read_config(folder)
     task = TASKS[config["task"]]
     priors = Priors.load(folder / "priors")
-    settings = from_json(Settings, config["settings"], f"{folder}/config.json: settings")
+    settings = settings_of(config, f"{folder}/config.json")
     converted = Data(prepared(data or (config["data"] and Path(config["data"]))))
     key = jax.random.key(seed)
     result: dict[str, Any] = {"run": str(given), "task": task.name, "seed": seed}
@@ -98,7 +98,7 @@ def _evaluate_run(given, prepared, data, metrics, methods, trials, impl, seed, r
                 continue
             kd, kp = jax.random.split(jax.random.fold_in(key, number))
             if "downstream" in metrics:
-                proposals = settings.evaluation.proposals
+                proposals = settings.evaluation.num_proposals
                 result["downstream"] += evaluate_split(split, env, priors, methods, trials, proposals, kd, report)
             if "priors" in metrics:
                 scores = _priors_split(folder, env, priors, settings, kp, split, report)
@@ -125,11 +125,11 @@ def evaluate_split(
     rows = []
     for name in methods:
         if name == "ours":
-            clouds = clouds_of(env.views, priors.config.networks.pointnet)
-            trial = ProposalTrials(env, clouds, priors.ensemble, proposals)
+            grouped_views = group_views(env.views, priors.config.networks.encoder)
+            trial = ProposalTrials(env, grouped_views, priors.predictor, proposals)
             method = _ours(trial, priors)
         elif name == "expert":
-            method = lambda start, key: (run_expert(env, start, key), None)  # noqa: E731
+            method = lambda start, key: (run_scripted_policy(env, start, key), None)
         else:
             method = random_method(env)
         label = f"evaluate {name} on {split}"
@@ -150,29 +150,35 @@ def _ours(trial: ProposalTrials, priors: Priors) -> Method:
 def _priors_split(
     folder: Path, env: Env, priors: Priors, settings: Settings, key: jax.Array, split: str, report: Report
 ) -> dict[str, Any]:
-    explorer = Explorer(env, settings.explore)
+    explorer = ExplorationLoop(env, settings.explore)
     policy = load_policy(folder, explorer)
     kl, km = jax.random.split(key)
     report(f"label trajectories on {split}", 0, 1, {})
     positive, negative = labelled(explorer, policy, _LABELLED, kl)
     if len(positive.view) == 0:
         return {"positives": 0}
-    clouds = clouds_of(env.views, priors.config.networks.pointnet)
+    grouped_views = group_views(env.views, priors.config.networks.encoder)
     result = priors_metrics(
-        priors.ensemble, priors.params, clouds, positive, negative, km, proposals=settings.evaluation.proposals
+        priors.predictor,
+        priors.params,
+        grouped_views,
+        positive,
+        negative,
+        km,
+        proposals=settings.evaluation.num_proposals,
     )
     report(f"label trajectories on {split}", 1, 1, {})
     return result
 
 
-def load_policy(folder: Path, explorer: Explorer) -> Any:
+def load_policy(folder: Path, explorer: ExplorationLoop) -> Any:
     """The parameters of a run's policy. Raises UserError where its file cannot be read."""
     path = folder / "policy.msgpack"
     try:
         return serialization.from_bytes(explorer.init(jax.random.key(0)).td3.policy, path.read_bytes())
     except (OSError, ValueError, KeyError, TypeError) as e:
         raise UserError(
-            f"{path}: cannot be read ({first_line(e)}); finish the run, or leave out --metrics priors, policy"
+            f"{path}: cannot be read ({summarize_error(e)}); finish the run, or leave out --metrics priors, policy"
         ) from e
 
 
@@ -184,14 +190,14 @@ def _evaluate_policy(
     `env` is of one folder: of a run on several, the others' objects are left out. Trials stop at success, as in the
     paper; a part that is let go is a failure. Consumes the key.
     """
-    explorer = Explorer(env, settings.explore)
+    explorer = ExplorationLoop(env, settings.explore)
     policy = load_policy(folder, explorer)
     k_pool, k_run = jax.random.split(key)
-    say = lambda done: report("policy's starts", done, trials, {})  # noqa: E731
+    say = lambda done: report("policy's starts", done, trials, {})
     pool = start_pool(env, k_pool, trials, say)
     wins = []
-    for batch in range(-(-trials // env.config.batch)):
-        final, _ = explorer.run(policy, pool, jax.random.fold_in(k_run, batch), 0.0, 0.0)
+    for batch in range(-(-trials // env.config.num_envs)):
+        final, _ = explorer.rollout(policy, pool, jax.random.fold_in(k_run, batch), 0.0, 0.0)
         wins.append(np.asarray(final.success))
     won = np.concatenate(wins)[:trials]
     interval = [float(x) for x in wilson_interval(int(won.sum()), trials)]

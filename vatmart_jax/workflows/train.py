@@ -17,12 +17,13 @@ from vatmart_jax.atomic_io import write_bytes, write_json
 from vatmart_jax.config import to_json
 from vatmart_jax.data.dataset import SPLITS, Data, DataError
 from vatmart_jax.envs.env import TASKS, Env, Task
-from vatmart_jax.errors import one_of
+from vatmart_jax.errors import require_one_of
 from vatmart_jax.physics.types import IMPLS
 from vatmart_jax.pipeline.presets import Settings
-from vatmart_jax.pipeline.run_dir import Run, read_metrics
-from vatmart_jax.pipeline.stage_timer import Clock
-from vatmart_jax.pipeline.trainer import Report, Training, perception_config, run_seconds
+from vatmart_jax.pipeline.run_config import FORMAT
+from vatmart_jax.pipeline.run_dir import RunDir, read_metrics
+from vatmart_jax.pipeline.stage_timer import StageTimer
+from vatmart_jax.pipeline.trainer import PipelineTrainer, Report, perception_config, run_seconds
 from vatmart_jax.priors.priors import Priors, PriorsConfig
 from vatmart_jax.viz import plots
 from vatmart_jax.workflows.evaluate import evaluate_split, markdown
@@ -34,9 +35,10 @@ def resolve(
     task: str, preset: str, impl: str, seed: int, settings: Settings, data: Path | None, more_data: Sequence[Path] = ()
 ) -> dict[str, Any]:
     """The config that is written beside every result. Raises UserError for an unknown task or impl."""
-    one_of("--task", task, TASKS)
-    one_of("--impl", impl, IMPLS)
+    require_one_of("--task", task, TASKS)
+    require_one_of("--impl", impl, IMPLS)
     return {
+        "format": FORMAT,
         "version": __version__,
         "task": task,
         "data": None if data is None else str(data.resolve()),
@@ -59,20 +61,20 @@ def train(
     task = TASKS[config["task"]]
     envs = environments(data, task, config["impl"], settings)
     described = priors_config(settings, task)  # refused before anything is written
-    with Run(out, config) as run:
-        training = Training(run, envs["train"], settings, config["seed"], report)
+    with RunDir(out, config) as run:
+        training = PipelineTrainer(run, envs["train"], settings, config["seed"], report)
         progress = training.train()
         priors = Priors(described, progress.perception.params)
         priors.save(out / "priors")
         policy = progress.explore.td3.target_policy  # a running mean, which succeeds more often than the last step
         write_bytes(out / "policy.msgpack", serialization.to_bytes(jax.device_get(policy)))
         tests = {split: env for split, env in envs.items() if split != "train"}
-        clock = Clock()
+        clock = StageTimer()
         results = []
         for number, (split, env) in enumerate(tests.items()):
             results += evaluate_split(
                 split, env, priors, ("ours", "random"), settings.evaluation.trials,
-                settings.evaluation.proposals, training.key("evaluate", number), report,
+                settings.evaluation.num_proposals, training.key("evaluate", number), report,
             )  # fmt: skip
         lap, seconds = clock.lap(), run_seconds(progress)
         seconds |= {"evaluate": round(lap.working, 1), "compile": round(seconds["compile"] + lap.compiling, 1)}
@@ -98,7 +100,7 @@ def train(
 def priors_config(settings: Settings, task: Task) -> PriorsConfig:
     """What a run with these settings makes priors of. Raises UserError for settings that make none."""
     networks = perception_config(settings, task).networks
-    return PriorsConfig(task.name, task.low, task.high, networks, settings.evaluation.copies)
+    return PriorsConfig(task.name, task.low, task.high, networks, settings.evaluation.num_augmentations)
 
 
 def environments(data: Data, task: Task, impl: str, settings: Settings) -> dict[str, Env]:
@@ -119,7 +121,7 @@ def draw_priors(priors: Priors, env: Env, key: jax.Array, out: Path) -> None:
     order = rng.permutation(len(env.views))
     objects = env.bank.object_id[env.views.scene[order]]
     order = order[np.sort(np.unique(objects, return_index=True)[1])]
-    start = env.sample_task(key, jnp.asarray(order[:_PICTURES], jnp.int32))
+    start = env.sample_goal(key, jnp.asarray(order[:_PICTURES], jnp.int32))
     for number, (view, task) in enumerate(zip(order[:_PICTURES].tolist(), np.asarray(start).tolist(), strict=True)):
         points = env.views.points[view].astype(np.float32)
         mask = env.views.part_mask[view]
