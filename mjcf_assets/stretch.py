@@ -14,7 +14,7 @@ from xml.etree import ElementTree
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from mjcf_assets.generator import GeneratorError, make_folder
+from mjcf_assets.output_folder import GeneratorError, make_output_folder
 from vatmart_jax.files import whole_folder, write_text
 
 LIMIT = 0.35  # of the logarithm of a length's factor
@@ -23,7 +23,7 @@ _ASKEW = 0.02  # sine of the angle by which a frame may be off its parent's axes
 _LEFT_BEHIND = shutil.ignore_patterns("*.urdf", "images", "bounding_box.json")
 
 
-def stretched_copies(source: Path, out: Path, count: int, seed: int) -> list[str]:
+def anisotropic_copies(source: Path, out: Path, count: int, seed: int) -> list[str]:
     """Write `count` stretched copies of every training object of `source` and a splits.json into `out`.
 
     source: a folder of PartNet-Mobility objects with a splits.json. Returns the ids, which name the folders: the
@@ -42,7 +42,7 @@ def stretched_copies(source: Path, out: Path, count: int, seed: int) -> list[str
     for name in originals:
         if Path(name).name != name or not (source / name).is_dir():
             raise GeneratorError(f"{source}/splits.json: {name!r} is no folder beside it; take it off the list")
-    make_folder(out, {f"{name}x{k}" for name in originals for k in range(count)})
+    make_output_folder(out, {f"{name}x{k}" for name in originals for k in range(count)})
     table: dict[str, list[str]] = {}
     for original, category in originals.items():
         for k in range(count):

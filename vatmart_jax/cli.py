@@ -87,8 +87,8 @@ def _convert(argv: list[str]) -> None:
 
 def _generate(argv: list[str]) -> None:
     """Make objects in PartNet-Mobility's layout: procedural ones, or stretched copies of others."""
-    from mjcf_assets.generator import generate
-    from mjcf_assets.stretch import stretched_copies
+    from mjcf_assets.procedural.generate import generate
+    from mjcf_assets.stretch import anisotropic_copies
 
     @dataclass(frozen=True)
     class Generate:
@@ -107,7 +107,7 @@ def _generate(argv: list[str]) -> None:
     if args.stretch is None:
         ids = generate(args.out, 200 if args.count is None else args.count, args.seed)
     else:
-        ids = stretched_copies(args.stretch, args.out, 4 if args.count is None else args.count, args.seed)
+        ids = anisotropic_copies(args.stretch, args.out, 4 if args.count is None else args.count, args.seed)
     _print_result({"objects": len(ids), "seconds": round(time.monotonic() - start, 2)}, args.json)
 
 
@@ -461,7 +461,7 @@ def _peek(argv: list[str], flag: str) -> str | None:
 def _prepared(data: Path | None, say: Callable[[str], None], points: int = 0) -> Path:
     """The converted folder of `data`, or of the bundled objects; views made now have at least so many points."""
     from conversion.convert import ConvertConfig, convert
-    from mjcf_assets.generator import generate
+    from mjcf_assets.procedural.generate import generate
     from vatmart_jax.data import BUNDLED_COUNT, BUNDLED_SEED, prepare
 
     def convert_into(source: Path, out: Path) -> None:

@@ -11,19 +11,16 @@ import trimesh
 import yourdfpy
 
 from conversion.partnet import PartNetObject, parts, read_object
-from mjcf_assets.furniture import Joint, Link, Style, porthole, turned
-from mjcf_assets.generator import (
-    CYCLE,
-    TRAINING,
-    GeneratorError,
-    generate,
-    microwave,
-    refrigerator,
-    storage_furniture,
-)
-from mjcf_assets.solids import Mesh, Rect, box
+from mjcf_assets.output_folder import GeneratorError
+from mjcf_assets.procedural.categories import CATEGORIES
+from mjcf_assets.procedural.categories.appliances import microwave, refrigerator
+from mjcf_assets.procedural.categories.storage import storage_furniture
+from mjcf_assets.procedural.components import Joint, Link, Style, porthole, rotate_about_y
+from mjcf_assets.procedural.generate import CYCLE, generate
+from mjcf_assets.procedural.solids import Mesh, Rect, box
 
 COUNT = 60
+TRAINING = {name for name, category in CATEGORIES.items() if category.test_shape_every}
 
 
 @pytest.fixture(scope="module")
@@ -40,8 +37,8 @@ def objects(folder) -> list[PartNetObject]:
 
 def test_every_category_has_objects_and_training_categories_have_test_shapes(folder):
     splits = json.loads((folder / "splits.json").read_text())
-    assert set(splits["train"]) == set(splits["test_shapes"]) == set(TRAINING)
-    assert set(splits["test_categories"]) == set(CYCLE) - set(TRAINING)
+    assert set(splits["train"]) == set(splits["test_shapes"]) == TRAINING
+    assert set(splits["test_categories"]) == set(CYCLE) - TRAINING
     ids = [i for split in splits.values() for group in split.values() for i in group]
     assert sorted(ids) == sorted(p.name for p in folder.glob("9*")) and len(set(ids)) == COUNT
 
@@ -109,7 +106,7 @@ def test_turned_furniture_opens_where_its_front_is():
     body = Link("heavy furniture_body", "cabinet_frame")
     front = Link("slider drawer", "drawer", body, Joint(np.array([0.0, 0.5, 1]), np.array([0.0, 0, 1]), 0.4))
     front.add("drawer_front", box((-0.5, 0, 0.9), (0.5, 1, 1)))
-    turned([front, body], np.pi / 2)
+    rotate_about_y([front, body], np.pi / 2)
     np.testing.assert_allclose(front.joint.axis, [1, 0, 0], atol=1e-12)
     np.testing.assert_allclose(front.joint.origin, [1, 0.5, 0], atol=1e-12)
     np.testing.assert_allclose(front.leaves[0][1][0].vertices.mean(0), [0.95, 0.5, 0], atol=1e-12)
@@ -140,11 +137,20 @@ def test_parts_swing_free(objects):
             moving = set(obj.subtree(part.link))
             for share in (0.0, 0.1, 0.5, 1.0):
                 poses = obj.link_poses({part.joint: part.closed + part.sign * share * part.width})
-                at = lambda k, v, poses=poses: v.vertices @ poses[k][:3, :3].T + poses[k][:3, 3]  # noqa: E731
-                points = np.concatenate([at(k, v) for k in moving for v in obj.links[k].visuals])
+                points = np.concatenate([_posed(v.vertices, poses[k]) for k in moving for v in obj.links[k].visuals])
                 for k, link in obj.links.items():
                     for v in link.visuals if k not in moving else ():
-                        assert _depth(points, Mesh(at(k, v), v.faces)) < 3e-3, (obj.id, part.link, share, k, v.name)
+                        assert _depth(points, Mesh(_posed(v.vertices, poses[k]), v.faces)) < 3e-3, (
+                            obj.id,
+                            part.link,
+                            share,
+                            k,
+                            v.name,
+                        )
+
+
+def _posed(points: np.ndarray, pose: np.ndarray) -> np.ndarray:
+    return points @ pose[:3, :3].T + pose[:3, 3]
 
 
 def _depth(points: np.ndarray, mesh: Mesh) -> float:
@@ -161,8 +167,8 @@ def test_portholes_are_closed_meshes_that_swing_free_of_their_panel(side):
     hollow = 0
     for seed in range(20):
         rng = np.random.default_rng(seed)
-        style, body = Style.draw(rng, {"bar": 1, "none": 1}, {"slab": 1}), Link("heavy body", "frame")
-        link = porthole(rng, style, body, cell, 0.5, side, "leaf")
+        style, body = Style.sample(rng, {"bar": 1, "none": 1}, {"slab": 1}), Link("heavy body", "frame")
+        link = porthole(rng, style, body, cell, z=0.5, side=side, leaf="leaf")
         (panel,), (leaf,) = body.leaves[0][1], link.leaves[0][1]
         for mesh in (panel, leaf):
             solid = trimesh.Trimesh(mesh.vertices, mesh.faces)
@@ -178,7 +184,7 @@ def test_portholes_are_where_the_style_has_them():
     drawn = {}
     for seed in range(60):
         rng = np.random.default_rng(seed)
-        wanted = Style.draw(np.random.default_rng(seed), {"bar": 1}, {"slab": 1}).porthole
+        wanted = Style.sample(np.random.default_rng(seed), {"bar": 1}, {"slab": 1}).porthole
         body = storage_furniture(rng)[-1]
         drawn.setdefault(wanted, []).append(any(name == "frame" for name, _ in body.leaves))
     assert all(drawn[True]) and not any(drawn[False]) and len(drawn[True]) > 3
@@ -187,7 +193,7 @@ def test_portholes_are_where_the_style_has_them():
 def test_fronts_are_boards_or_sheets():
     drawn = {False: 0, True: 0}
     for seed in range(40):
-        style = Style.draw(np.random.default_rng(seed), {"bar": 1}, {"slab": 1})
+        style = Style.sample(np.random.default_rng(seed), {"bar": 1}, {"slab": 1})
         for maker in (refrigerator, microwave):
             link = next(x for x in maker(np.random.default_rng(seed)) if x.name == "door")
             if style.porthole and maker is microwave:

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from mjcf_assets.generator import generate
+from mjcf_assets.procedural.generate import generate
 
 # Index of an object of seed 0, its category, and the hash of its semantics.txt and meshes. One of each category.
 GOLDEN = {
