@@ -1,19 +1,30 @@
-"""PartNet-Mobility's on-disk layout of one object."""
+"""PartNet-Mobility's on-disk layout of one object.
+
+Meshes and joints are written in PartNet's mesh frame (see `solids`), scaled so that the object's diagonal is about 2;
+the joint of the body turns them into the URDF's root frame, which is z up with the front towards -x.
+"""
 
 from __future__ import annotations
 
 import json
 from pathlib import Path
-from xml.sax.saxutils import quoteattr
+from xml.etree import ElementTree
 
 import numpy as np
 
 from mjcf_assets.procedural.components import Link
 from vatmart_jax.files import whole_folder
 
+# Roll, pitch, yaw from PartNet's mesh frame to the URDF's root frame, as the data set writes it.
+_BODY_RPY = "1.570796326794897 0 -1.570796326794897"
+
 
 def write_object(folder: Path, category: str, links: list[Link], rng: np.random.Generator) -> None:
-    """One object folder, complete or not at all. The links come in any order, the body is the one without a parent."""
+    """Write one object folder, complete or not at all.
+
+    links: in any order, the body last. rng: draws the order of the links, the object's size and its offset from the
+    origin.
+    """
     if rng.random() < 0.5:
         links = [links[-1], *links[:-1]]
     points = np.concatenate([m.vertices for link in links for _, meshes in link.leaves for m in meshes])
@@ -22,87 +33,90 @@ def write_object(folder: Path, category: str, links: list[Link], rng: np.random.
     scale = rng.uniform(2.0, 2.08) / float(np.linalg.norm(hi - lo))
     centre = (lo + hi) / 2 + rng.normal(0, 0.015, 3)
     index = {id(link): i for i, link in enumerate(links)}
-    origin = [
+    origins = [
         np.zeros(3) if link.joint is None or not link.joint.origin.any() else scale * (link.joint.origin - centre)
         for link in links
     ]
+    robot = ElementTree.Element("robot", name=f"partnet_{folder.name}")
+    ElementTree.SubElement(robot, "link", name="base")
+    semantics, mobility = [], []
     with whole_folder(folder) as part:
         (part / "textured_objs").mkdir()
-        urdf, semantics, mobility = [], [], []
-        objs = parts = 0
+        n_meshes = n_leaves = 0
         for i, link in enumerate(links):
             parent = -1 if link.parent is None else index[id(link.parent)]
-            base = np.zeros(3) if parent < 0 else origin[parent]
-            visuals, names = [], []
+            parent_origin = np.zeros(3) if parent < 0 else origins[parent]
+            visuals, leaves = [], []
             for name, meshes in link.leaves:
-                parts += 1
-                names.append({"id": parts, "name": name, "children": []})
+                n_leaves += 1
+                leaves.append({"id": n_leaves, "name": name, "children": []})
                 for mesh in meshes:
-                    objs += 1
-                    file = f"textured_objs/original-{objs}.obj"
-                    text = _obj(f"{name}-{objs}", scale * (mesh.vertices - centre), mesh.faces)
+                    n_meshes += 1
+                    file = f"textured_objs/original-{n_meshes}.obj"
+                    text = _obj(f"{name}-{n_meshes}", scale * (mesh.vertices - centre), mesh.faces)
                     (part / file).write_text(text)
-                    visuals.append((f"{name}-{parts}", file))
+                    visuals.append((f"{name}-{n_leaves}", file))
             semantics.append(f"link_{i} {link.kind}")
-            urdf += _link(i, visuals, -origin[i]) + _joint(i, link, parent, origin[i] - base, scale)
+            _add_link(robot, i, visuals, -origins[i])
+            _add_joint(robot, i, link, parent=parent, xyz=origins[i] - parent_origin, scale=scale)
             mobility.append({
-                "id": i, "parent": parent, "joint": link.kind.split()[0], "name": link.name, "parts": names,
-                "jointData": _joint_data(link, origin[i], scale),
+                "id": i, "parent": parent, "joint": link.kind.split()[0], "name": link.name, "parts": leaves,
+                "jointData": _joint_data(link, origins[i], scale),
             })  # fmt: skip
-        (part / "mobility.urdf").write_text(
-            "\n".join(
-                ['<?xml version="1.0" ?>', f'<robot name="partnet_{folder.name}">', '\t<link name="base"/>', *urdf]
-            )
-            + "\n</robot>\n"
-        )
+        ElementTree.indent(robot, "\t")
+        ElementTree.ElementTree(robot).write(part / "mobility.urdf", encoding="utf-8", xml_declaration=True)
         (part / "semantics.txt").write_text("\n".join(semantics) + "\n")
         (part / "mobility_v2.json").write_text(json.dumps(mobility))
         meta = {"model_id": folder.name, "anno_id": folder.name, "user_id": "procedural", "time_in_sec": "0",
                 "version": "1", "model_cat": category}  # fmt: skip
         (part / "meta.json").write_text(json.dumps(meta))
-        box_ = {"min": (scale * (lo - centre)).round(6).tolist(), "max": (scale * (hi - centre)).round(6).tolist()}
-        (part / "bounding_box.json").write_text(json.dumps(box_))
+        bounds = {"min": (scale * (lo - centre)).round(6).tolist(), "max": (scale * (hi - centre)).round(6).tolist()}
+        (part / "bounding_box.json").write_text(json.dumps(bounds))
 
 
 def _obj(name: str, vertices: np.ndarray, faces: np.ndarray) -> str:
+    """A Wavefront OBJ file of vertices [n, 3] and triangles [m, 3], counted from 0."""
     lines = [f"o {name}", *("v {:.6f} {:.6f} {:.6f}".format(*v) for v in vertices)]
     return "\n".join([*lines, *("f {} {} {}".format(*f) for f in faces + 1)]) + "\n"
 
 
-def _xyz(v: np.ndarray) -> str:
-    return '"' + " ".join(repr(float(x) + 0.0) for x in v) + '"'
+def _text(numbers: np.ndarray) -> str:
+    return " ".join(repr(float(x) + 0.0) for x in numbers)  # no -0.0
 
 
-def _link(i: int, visuals: list[tuple[str, str]], origin: np.ndarray) -> list[str]:
-    lines = [f'\t<link name="link_{i}">']
+def _add_link(robot: ElementTree.Element, i: int, visuals: list[tuple[str, str]], origin: np.ndarray) -> None:
+    """Add link_i with its visuals (name, mesh file), each a collision as well. origin: of the meshes, link frame."""
+    link = ElementTree.SubElement(robot, "link", name=f"link_{i}")
     for tag in ("visual", "collision"):
         for name, file in visuals:
-            lines += [
-                f"\t\t<{tag} name={quoteattr(name)}>" if tag == "visual" else f"\t\t<{tag}>",
-                f"\t\t\t<origin xyz={_xyz(origin)}/>",
-                "\t\t\t<geometry>",
-                f'\t\t\t\t<mesh filename="{file}"/>',
-                "\t\t\t</geometry>",
-                f"\t\t</{tag}>",
-            ]
-    return [*lines, "\t</link>"]
+            element = ElementTree.SubElement(link, tag, {"name": name} if tag == "visual" else {})
+            ElementTree.SubElement(element, "origin", xyz=_text(origin))
+            geometry = ElementTree.SubElement(element, "geometry")
+            ElementTree.SubElement(geometry, "mesh", filename=file)
 
 
-def _joint(i: int, link: Link, parent: int, xyz: np.ndarray, scale: float) -> list[str]:
+def _add_joint(robot: ElementTree.Element, i: int, link: Link, *, parent: int, xyz: np.ndarray, scale: float) -> None:
+    """Add joint_i between link_i and its parent, `base` where that is -1. xyz: where it is, in the parent's frame."""
     slide = link.kind.startswith("slider")
     if link.joint is None:
-        kind, middle = "fixed", [f'\t\t<origin rpy="1.570796326794897 0 -1.570796326794897" xyz={_xyz(xyz)}/>']
+        kind = "fixed"
     else:
         kind = "continuous" if link.joint.upper is None else "prismatic" if slide else "revolute"
-        middle = [f"\t\t<origin xyz={_xyz(xyz)}/>", f"\t\t<axis xyz={_xyz(link.joint.axis)}/>"]
-    lines = [f'\t<joint name="joint_{i}" type="{kind}">', *middle, f'\t\t<child link="link_{i}"/>']
-    lines.append(f'\t\t<parent link="{"base" if parent < 0 else f"link_{parent}"}"/>')
+    joint = ElementTree.SubElement(robot, "joint", name=f"joint_{i}", type=kind)
+    if link.joint is None:
+        ElementTree.SubElement(joint, "origin", rpy=_BODY_RPY, xyz=_text(xyz))
+    else:
+        ElementTree.SubElement(joint, "origin", xyz=_text(xyz))
+        ElementTree.SubElement(joint, "axis", xyz=_text(link.joint.axis))
+    ElementTree.SubElement(joint, "child", link=f"link_{i}")
+    ElementTree.SubElement(joint, "parent", link="base" if parent < 0 else f"link_{parent}")
     if link.joint is not None and link.joint.upper is not None:
-        lines.append(f'\t\t<limit lower="0.0" upper="{float(link.joint.upper * (scale if slide else 1))}"/>')
-    return [*lines, "\t</joint>"]
+        upper = float(link.joint.upper * (scale if slide else 1))
+        ElementTree.SubElement(joint, "limit", lower="0.0", upper=str(upper))
 
 
 def _joint_data(link: Link, origin: np.ndarray, scale: float) -> dict:
+    """`jointData` of mobility_v2.json: lengths scaled, angles in degrees."""
     if link.joint is None:
         return {}
     upper = link.joint.upper
