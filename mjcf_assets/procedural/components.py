@@ -5,6 +5,7 @@ Frame and units as in `solids`; lengths fit objects whose bounding box has a dia
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from itertools import pairwise
 
@@ -74,7 +75,7 @@ class Style:
     porthole: bool  # single doors are portholes where there is room
 
     @classmethod
-    def sample(cls, rng: np.random.Generator, handles: dict[str, float], faces: dict[str, float]) -> Style:
+    def sample(cls, rng: np.random.Generator, handles: Mapping[str, float], faces: Mapping[str, float]) -> Style:
         reach = float(np.clip(rng.lognormal(np.log(0.047), 0.45), 0.012, 0.095))
         # Of a generator of their own, so that objects without them are the same as before there were any.
         later = rng.spawn(1)[0]
@@ -102,7 +103,7 @@ class Style:
         return (z - self.recess - self.front, z - self.recess) if self.inset else (z, z + self.front)
 
 
-def weighted_choice(rng: np.random.Generator, weights: dict[str, float]) -> str:
+def weighted_choice(rng: np.random.Generator, weights: Mapping[str, float]) -> str:
     """One of the keys, as likely as its weight."""
     p = np.array(list(weights.values()))
     return str(rng.choice(list(weights), p=p / p.sum()))
@@ -351,6 +352,11 @@ def rotate_about_y(links: list[Link], angle: float) -> list[Link]:
 def mirror_in_depth(meshes: list[Mesh], z: float) -> list[Mesh]:
     """Meshes seen in a mirror at depth z."""
     return [Mesh(m.vertices * [1, 1, -1] + [0, 0, 2 * z], m.faces[:, ::-1]) for m in meshes]
+
+
+def face_up(meshes: list[Mesh], at: np.ndarray) -> list[Mesh]:
+    """Meshes made at the origin of a front that faces +z, moved to `at` [3] on a surface that faces +y."""
+    return [Mesh(m.vertices[:, [0, 2, 1]] * [1, 1, -1] + at, m.faces) for m in meshes]
 
 
 def sample_size(rng: np.random.Generator, *ranges: tuple[float, float]) -> np.ndarray:

@@ -151,8 +151,14 @@ def _pierced(outer: np.ndarray, inner: np.ndarray, axis: int, lo: float, hi: flo
     )
 
 
-def hollow_block(rect: Rect, hole: Rect, z0: float, floor: float, z1: float, radius: float = 0.0) -> Mesh:
-    """A block from z0 to z1 with a pocket, open towards +z, down to z = floor. radius: of its outer edges."""
+def hollow_block(
+    rect: Rect, hole: Rect, lo: float, floor: float, hi: float, *, radius: float = 0.0, axis: int = 2
+) -> Mesh:
+    """A block from lo to hi along an axis, with a pocket that is open at hi and reaches to floor.
+
+    rect, hole: outlines in the other two axes. lo may be above hi: the pocket is then open downwards. radius: of the
+    outer edges.
+    """
     outer = rounded(rect, radius) if radius else corners(rect)
     inner = rounded(hole, 0.004) if radius else corners(hole)
-    return loft([ring_at(outer, 2, z0), ring_at(outer, 2, z1), ring_at(inner, 2, z1), ring_at(inner, 2, floor)])
+    return loft([ring_at(ring, axis, at) for ring, at in ((outer, lo), (outer, hi), (inner, hi), (inner, floor))])

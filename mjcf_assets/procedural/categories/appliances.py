@@ -53,7 +53,7 @@ def refrigerator(rng: np.random.Generator) -> list[Link]:
         if boxes:
             carcass(body, r, 0, d, wall)
         else:
-            body.add("frame", hollow_block(r, hole, 0, wall, d, radius))
+            body.add("frame", hollow_block(r, hole, 0, wall, d, radius=radius))
         n = int(rng.integers(0, 2 + int(hole.height / 0.3)))
         for y in np.linspace(hole.y0, hole.y1, n + 2)[1:-1]:
             shelf = hole._replace(y0=y - 0.008, y1=y + 0.008)

@@ -36,7 +36,7 @@ def safe(rng: np.random.Generator) -> list[Link]:
     wall = rng.uniform(0.05, 0.12)
     hole = shell.shrink(wall)
     if rng.random() < 0.7:
-        body.add("base_body", hollow_block(shell, hole, 0, wall, d, rng.choice([0.0, 0.0, 0.06])))
+        body.add("base_body", hollow_block(shell, hole, 0, wall, d, radius=rng.choice([0.0, 0.0, 0.06])))
     else:
         carcass(body, shell, 0, d, wall)
         body.leaves = [("base_body", meshes) for _, meshes in body.leaves]
