@@ -17,8 +17,8 @@ from scipy.spatial.transform import Rotation
 from mjcf_assets.output_folder import GeneratorError, make_output_folder
 from vatmart_jax.files import whole_folder, write_text
 
-LIMIT = 0.35  # of the logarithm of a length's factor
-_ASKEW = 0.02  # sine of the angle by which a frame may be off its parent's axes
+MAX_LOG_FACTOR = 0.35  # of the logarithm of the factor of a length, before factors are scaled to keep the volume
+_MAX_SKEW = 0.02  # sine of the angle by which a frame may be off its parent's axes
 # Pictures are large and copies are for training, which sees no colours; the bounding box is another one.
 _LEFT_BEHIND = shutil.ignore_patterns("*.urdf", "images", "bounding_box.json")
 
@@ -46,7 +46,7 @@ def anisotropic_copies(source: Path, out: Path, count: int, seed: int) -> list[s
     table: dict[str, list[str]] = {}
     for original, category in originals.items():
         for k in range(count):
-            draws = np.random.default_rng([seed, k, *original.encode()]).uniform(-LIMIT, LIMIT, 3)
+            draws = np.random.default_rng([seed, k, *original.encode()]).uniform(-MAX_LOG_FACTOR, MAX_LOG_FACTOR, 3)
             robot = _stretched(source / original / "mobility.urdf", np.exp(draws - draws.mean()))
             if robot is None:
                 break
@@ -101,7 +101,7 @@ def _stretch_origin(element: ElementTree.Element, factors: np.ndarray) -> np.nda
     origin.set("xyz", _text(_numbers(origin.get("xyz", "0 0 0")) * factors))
     turn = Rotation.from_euler("xyz", _numbers(origin.get("rpy", "0 0 0"))).as_matrix()
     axes = np.abs(turn) > 0.5
-    return axes.T @ factors if np.abs(turn[~axes]).max() < _ASKEW else None
+    return axes.T @ factors if np.abs(turn[~axes]).max() < _MAX_SKEW else None
 
 
 def _stretch_axis(joint: ElementTree.Element, factors: np.ndarray) -> None:

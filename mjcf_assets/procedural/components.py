@@ -1,4 +1,4 @@
-"""Doors, drawers, handles, carcasses: what the procedural objects are put together from.
+"""Components of the procedural objects: links and joints, doors, drawers, handles, carcasses, legs, controls.
 
 Frame and units as in `solids`; lengths fit objects whose bounding box has a diagonal of about 2.
 """
@@ -76,8 +76,9 @@ class Style:
 
     @classmethod
     def sample(cls, rng: np.random.Generator, handles: Mapping[str, float], faces: Mapping[str, float]) -> Style:
+        """A random style; handles and faces: kinds with their weights."""
         reach = float(np.clip(rng.lognormal(np.log(0.047), 0.45), 0.012, 0.095))
-        # Of a generator of their own, so that objects without them are the same as before there were any.
+        # From a generator of their own: portholes and sheets came later, and objects without them are to stay the same.
         later = rng.spawn(1)[0]
         porthole = bool(later.random() < 0.15)
         sheet = float(later.uniform(0.003, 0.012)) if later.random() < 0.3 else 0.0

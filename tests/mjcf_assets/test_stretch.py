@@ -15,7 +15,7 @@ from scipy.spatial import cKDTree
 from conversion.partnet import parts, read_object
 from mjcf_assets.output_folder import GeneratorError
 from mjcf_assets.procedural.generate import generate
-from mjcf_assets.stretch import LIMIT, anisotropic_copies
+from mjcf_assets.stretch import MAX_LOG_FACTOR, anisotropic_copies
 from vatmart_jax.cli import main
 
 
@@ -71,7 +71,7 @@ def test_the_closed_object_is_stretched_and_its_parts_are_the_same(source, copie
             found_at = cKDTree(np.hstack([after, mesh])).query(np.hstack([before * factor, mesh]))[1]
             assert len(np.unique(found_at)) == len(before) == len(after)
             np.testing.assert_allclose(after[found_at], before * factor, atol=2e-3)
-            assert (np.abs(np.log(factor)) <= 2 * LIMIT).all() and abs(np.log(factor).sum()) < 1e-2
+            assert (np.abs(np.log(factor)) <= 2 * MAX_LOG_FACTOR).all() and abs(np.log(factor).sum()) < 1e-2
             factors.append(factor)
             again, _ = parts(copy)
             assert [(p.link, p.kind, p.sign) for p in again] == [(p.link, p.kind, p.sign) for p in found]
