@@ -14,16 +14,16 @@ from xml.etree import ElementTree
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from mjcf_assets.generator import GeneratorError, make_folder
+from mjcf_assets.output_folder import GeneratorError, make_output_folder
 from vatmart_jax.atomic_io import atomic_directory, write_text
 
-LIMIT = 0.35  # of the logarithm of a length's factor
-_ASKEW = 0.02  # sine of the angle by which a frame may be off its parent's axes
+MAX_LOG_FACTOR = 0.35  # of the logarithm of the factor of a length, before factors are scaled to keep the volume
+_MAX_SKEW = 0.02  # sine of the angle by which a frame may be off its parent's axes
 # Pictures are large and copies are for training, which sees no colours; the bounding box is another one.
 _LEFT_BEHIND = shutil.ignore_patterns("*.urdf", "images", "bounding_box.json")
 
 
-def stretched_copies(source: Path, out: Path, count: int, seed: int) -> list[str]:
+def anisotropic_copies(source: Path, out: Path, count: int, seed: int) -> list[str]:
     """Write `count` stretched copies of every training object of `source` and a splits.json into `out`.
 
     source: a folder of PartNet-Mobility objects with a splits.json. Returns the ids, which name the folders: the
@@ -42,11 +42,11 @@ def stretched_copies(source: Path, out: Path, count: int, seed: int) -> list[str
     for name in originals:
         if Path(name).name != name or not (source / name).is_dir():
             raise GeneratorError(f"{source}/splits.json: {name!r} is no folder beside it; take it off the list")
-    make_folder(out, {f"{name}x{k}" for name in originals for k in range(count)})
+    make_output_folder(out, {f"{name}x{k}" for name in originals for k in range(count)})
     table: dict[str, list[str]] = {}
     for original, category in originals.items():
         for k in range(count):
-            draws = np.random.default_rng([seed, k, *original.encode()]).uniform(-LIMIT, LIMIT, 3)
+            draws = np.random.default_rng([seed, k, *original.encode()]).uniform(-MAX_LOG_FACTOR, MAX_LOG_FACTOR, 3)
             robot = _stretched(source / original / "mobility.urdf", np.exp(draws - draws.mean()))
             if robot is None:
                 break
@@ -101,7 +101,7 @@ def _stretch_origin(element: ElementTree.Element, factors: np.ndarray) -> np.nda
     origin.set("xyz", _text(_numbers(origin.get("xyz", "0 0 0")) * factors))
     turn = Rotation.from_euler("xyz", _numbers(origin.get("rpy", "0 0 0"))).as_matrix()
     axes = np.abs(turn) > 0.5
-    return axes.T @ factors if np.abs(turn[~axes]).max() < _ASKEW else None
+    return axes.T @ factors if np.abs(turn[~axes]).max() < _MAX_SKEW else None
 
 
 def _stretch_axis(joint: ElementTree.Element, factors: np.ndarray) -> None:

@@ -20,7 +20,7 @@ from conversion.decompose import DecomposeConfig
 from conversion.handles import handles
 from conversion.partnet import ConvertedObject, ObjectError
 from conversion.scenes import scene_bank
-from mjcf_assets.generator import generate
+from mjcf_assets.procedural.generate import generate
 from vatmart_jax.data.banks import SceneBank, ViewBank
 
 QUICK = ConvertConfig(views=1, points=64, contacts=16, variants=2)

@@ -13,7 +13,7 @@ from generated import box, joint, made, read_with_hulls
 
 from conversion.mjcf import COLLISION_GROUP, VISUAL_GROUP, Mjcf, MjcfConfig, to_mjcf
 from conversion.partnet import ConvertedObject, Hull, Joint, ObjectError
-from mjcf_assets.generator import generate
+from mjcf_assets.procedural.generate import generate
 
 REAL = ("45194", "103480", "101612", "11826", "10144", "12249", "22301", "12428")
 

@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 
 from conversion.partnet import ConvertedObject, Hull, ObjectError
 from conversion.scenes import other_values, scene_bank
-from mjcf_assets.generator import generate
+from mjcf_assets.procedural.generate import generate
 from vatmart_jax.data.banks import HINGE, SLIDE, SceneBank, Scenes
 
 # One of each quirk: ranges that exclude 0, go below it, or start past it; buttons on a door; a plain cabinet.

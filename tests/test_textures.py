@@ -15,7 +15,7 @@ from conversion.convert import ConvertConfig, _key, convert
 from conversion.mjcf import VISUAL_GROUP, MjcfConfig, to_mjcf
 from conversion.partnet import PartNetObject, read_object
 from conversion.textures import read_mtl, read_png
-from mjcf_assets.generator import generate
+from mjcf_assets.procedural.generate import generate
 
 # An upright square with a picture, its lower half in both windings, and a triangle of another material.
 MESH = """mtllib door.mtl

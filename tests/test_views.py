@@ -14,7 +14,7 @@ from conversion.mjcf import VISUAL_GROUP, MjcfConfig, to_mjcf
 from conversion.partnet import ConvertedObject, ObjectError
 from conversion.scenes import other_values, scene_bank
 from conversion.views import DISTANCE, TASKS, views
-from mjcf_assets.generator import generate
+from mjcf_assets.procedural.generate import generate
 from vatmart_jax.data.banks import SceneBank, ViewBank
 
 REAL = ("45194", "101564", "7167")

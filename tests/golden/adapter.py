@@ -16,7 +16,7 @@ from unittest import mock
 import numpy as np
 
 from conversion.convert import ConvertConfig, convert
-from mjcf_assets.generator import generate
+from mjcf_assets.procedural.generate import generate
 from vatmart_jax.cli.main import COMMANDS, main
 from vatmart_jax.data.banks import SceneBank, ViewBank
 from vatmart_jax.data.dataset import Data
@@ -61,8 +61,8 @@ _DOOR = Settings(
     explore=ExplorationConfig(
         td3=TD3Config(hidden=32, batch_size=32, buffer_size=1000, grad_steps_per_iter=4),
         iterations=4,
-        pool=32,
-        warmup=2,
+        start_pool_size=32,
+        warmup_iters=2,
     ),
     perception=PerceptionConfig(
         networks=NetworksConfig(

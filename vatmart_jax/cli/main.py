@@ -4,7 +4,6 @@
 import json
 import os
 import sys
-import time
 from collections.abc import Callable
 from ctypes.util import find_library
 from dataclasses import asdict, dataclass, field
@@ -87,28 +86,10 @@ def _convert(argv: list[str]) -> None:
 
 def _generate(argv: list[str]) -> None:
     """Make objects in PartNet-Mobility's layout: procedural ones, or stretched copies of others."""
-    from mjcf_assets.generator import generate
-    from mjcf_assets.stretch import stretched_copies
-
-    @dataclass(frozen=True)
-    class Generate:
-        """Make objects in PartNet-Mobility's layout, the same ones for the same seed."""
-
-        out: Path
-        count: int | None = None
-        """objects, default 200; with --stretch copies of each, default 4"""
-        stretch: Path | None = None
-        """instead of procedural objects, copies of the training objects in this folder, stretched along their axes"""
-        seed: int = 0
-        json: _Json = False
+    from mjcf_assets.command import Generate
 
     args = tyro.cli(Generate, args=argv, prog="vatmart generate")
-    start = time.monotonic()
-    if args.stretch is None:
-        ids = generate(args.out, 200 if args.count is None else args.count, args.seed)
-    else:
-        ids = stretched_copies(args.stretch, args.out, 4 if args.count is None else args.count, args.seed)
-    _print_result({"objects": len(ids), "seconds": round(time.monotonic() - start, 2)}, args.json)
+    _print_result(args.run(), args.json)
 
 
 def _train(argv: list[str]) -> None:
@@ -461,7 +442,7 @@ def _peek(argv: list[str], flag: str) -> str | None:
 def _prepared(data: Path | None, say: Callable[[str], None], points: int = 0) -> Path:
     """The converted folder of `data`, or of the bundled objects; views made now have at least so many points."""
     from conversion.convert import ConvertConfig, convert
-    from mjcf_assets.generator import generate
+    from mjcf_assets.procedural.generate import generate
     from vatmart_jax.data.dataset import BUNDLED_COUNT, BUNDLED_SEED, prepare
 
     def convert_into(source: Path, out: Path) -> None:

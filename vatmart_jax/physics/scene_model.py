@@ -7,11 +7,11 @@ objects is bit-identical to the Scene's own model.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from importlib import resources
 
 import mujoco
 import numpy as np
 
+from mjcf_assets import scene_template
 from vatmart_jax.data.banks import HINGE, SceneBank
 
 TIP = 0.1122  # from the hand's origin to the fingertips along z, unit lengths
@@ -115,7 +115,7 @@ def _mesh_name(shape: int) -> str:
 
 
 def _spec(bank: SceneBank, scene: int, slots: tuple[int, int], config: PhysicsConfig, shapes) -> mujoco.MjSpec:
-    spec = mujoco.MjSpec.from_string(resources.files("mjcf_assets").joinpath("scene.xml").read_text())
+    spec = mujoco.MjSpec.from_string(scene_template())
     spec.compiler.degree = False
     option = spec.option
     option.timestep, option.impratio = config.timestep, config.impratio

@@ -13,8 +13,9 @@ import pytest
 from scipy.spatial import cKDTree
 
 from conversion.partnet import parts, read_object
-from mjcf_assets.generator import GeneratorError, generate
-from mjcf_assets.stretch import LIMIT, stretched_copies
+from mjcf_assets.output_folder import GeneratorError
+from mjcf_assets.procedural.generate import generate
+from mjcf_assets.stretch import MAX_LOG_FACTOR, anisotropic_copies
 from vatmart_jax.cli.main import main
 
 
@@ -70,7 +71,7 @@ def test_the_closed_object_is_stretched_and_its_parts_are_the_same(source, copie
             found_at = cKDTree(np.hstack([after, mesh])).query(np.hstack([before * factor, mesh]))[1]
             assert len(np.unique(found_at)) == len(before) == len(after)
             np.testing.assert_allclose(after[found_at], before * factor, atol=2e-3)
-            assert (np.abs(np.log(factor)) <= 2 * LIMIT).all() and abs(np.log(factor).sum()) < 1e-2
+            assert (np.abs(np.log(factor)) <= 2 * MAX_LOG_FACTOR).all() and abs(np.log(factor).sum()) < 1e-2
             factors.append(factor)
             again, _ = parts(copy)
             assert [(p.link, p.kind, p.sign) for p in again] == [(p.link, p.kind, p.sign) for p in found]
@@ -94,8 +95,8 @@ def test_an_open_drawer_goes_as_far_as_its_own_depth_allows(source, copies):
 
 
 def test_the_same_seed_makes_the_same_copies_and_more_of_them_leave_the_first_alone(source, copies, tmp_path):
-    stretched_copies(source, tmp_path / "more", 3, seed=0)
-    stretched_copies(source, tmp_path / "other", 1, seed=1)
+    anisotropic_copies(source, tmp_path / "more", 3, seed=0)
+    anisotropic_copies(source, tmp_path / "other", 1, seed=1)
     for name in training(source):
         urdf = f"{name}x0/mobility.urdf"
         assert (tmp_path / "more" / urdf).read_bytes() == (copies / urdf).read_bytes()
@@ -116,7 +117,7 @@ def test_an_object_with_a_frame_askew_gets_no_copies(source, tmp_path):
     """Turned and stretched, it would be sheared."""
     name = sorted(training(source))[0]
     bent = damaged(source, tmp_path / "bent", r"<origin xyz=", '<origin rpy="0 0.4 0" xyz=')
-    made = stretched_copies(bent, tmp_path / "out", 1, seed=0)
+    made = anisotropic_copies(bent, tmp_path / "out", 1, seed=0)
     assert f"{name}x0" not in made and len(made) == len(training(source)) - 1
 
 
@@ -127,7 +128,7 @@ def test_a_broken_urdf_is_named_and_nothing_half_written_stays(source, tmp_path,
     broken = damaged(source, tmp_path / "broken", old, new)
     name = sorted(training(source))[0]
     with pytest.raises(GeneratorError, match=f"{name}/mobility.urdf: cannot be stretched"):
-        stretched_copies(broken, tmp_path / "out", 1, seed=0)
+        anisotropic_copies(broken, tmp_path / "out", 1, seed=0)
     assert not (tmp_path / "out" / f"{name}x0").exists()
 
 
@@ -147,15 +148,15 @@ def test_a_list_of_objects_that_cannot_be_used_is_refused(tmp_path, table, messa
     if table is not None:
         (tmp_path / "from" / "splits.json").write_text(table)
     with pytest.raises(GeneratorError, match=rf"from/splits.json: .*{message}"):
-        stretched_copies(tmp_path / "from", tmp_path / "out", 1, seed=0)
+        anisotropic_copies(tmp_path / "from", tmp_path / "out", 1, seed=0)
     assert not (tmp_path / "out").exists()
 
 
 def test_other_objects_in_the_folder_and_numbers_out_of_range_are_refused(source, tmp_path):
     with pytest.raises(GeneratorError, match="expected 1 <= count"):
-        stretched_copies(source, tmp_path / "out", 0, seed=0)
+        anisotropic_copies(source, tmp_path / "out", 0, seed=0)
     with pytest.raises(GeneratorError, match="holds other objects"):
-        stretched_copies(source, source, 1, seed=0)
+        anisotropic_copies(source, source, 1, seed=0)
 
 
 def test_links_to_files_elsewhere_are_not_followed(source, tmp_path):
@@ -163,5 +164,5 @@ def test_links_to_files_elsewhere_are_not_followed(source, tmp_path):
     name = sorted(training(source))[0]
     (tmp_path / "secret.obj").write_text("v 0 0 0")
     os.symlink(tmp_path / "secret.obj", tmp_path / "from" / name / "textured_objs" / "secret.obj")
-    stretched_copies(tmp_path / "from", tmp_path / "out", 1, seed=0)
+    anisotropic_copies(tmp_path / "from", tmp_path / "out", 1, seed=0)
     assert (tmp_path / "out" / f"{name}x0" / "textured_objs" / "secret.obj").is_symlink()

@@ -48,8 +48,8 @@ def loft(rings: list[np.ndarray], closed: bool = False) -> Mesh:
     k, n = len(rings[0]), len(rings)
     a = (np.arange(n if closed else n - 1)[:, None] * k + np.arange(k)).ravel()
     b = a // k * k + (a + 1) % k
-    up = lambda i: (i + k) % (n * k)
-    faces = [np.stack([a, b, up(b)], 1), np.stack([a, up(b), up(a)], 1)]
+    above_a, above_b = (a + k) % (n * k), (b + k) % (n * k)
+    faces = [np.stack([a, b, above_b], 1), np.stack([a, above_b, above_a], 1)]
     if not closed:
         fan = np.stack([np.zeros(k - 2, int), np.arange(2, k), np.arange(1, k - 1)], 1)
         faces += [fan, fan[:, ::-1] + (n - 1) * k]
@@ -60,25 +60,25 @@ def loft(rings: list[np.ndarray], closed: bool = False) -> Mesh:
     return Mesh(vertices, faces)
 
 
-def place(ring: np.ndarray, axis: int, at: float) -> np.ndarray:
+def ring_at(ring: np.ndarray, axis: int, at: float) -> np.ndarray:
     """A flat ring [k, 2] as points [k, 3] in the plane `axis` = `at`."""
     return np.insert(ring, axis, at, axis=1)
 
 
-def corners(r: Rect) -> np.ndarray:
-    return np.array([[r.x0, r.y0], [r.x1, r.y0], [r.x1, r.y1], [r.x0, r.y1]])
+def corners(rect: Rect) -> np.ndarray:
+    return np.array([[rect.x0, rect.y0], [rect.x1, rect.y0], [rect.x1, rect.y1], [rect.x0, rect.y1]])
 
 
-def rounded(r: Rect, radius: float, sides: int = 24, start: float = 0.5) -> np.ndarray:
+def rounded(rect: Rect, radius: float, sides: int = 24, start: float = 0.5) -> np.ndarray:
     """Outline of a rectangle with round corners; an ellipse where the radius is half the sides. [sides, 2].
 
     start: where the first point lies, counted in points from the middle of the +x side.
     """
     t = 2 * np.pi * (np.arange(sides) + start) / sides
-    half = np.array([r.width, r.height]) / 2
+    half = np.array([rect.width, rect.height]) / 2
     bend = np.minimum(radius, half)
     unit = np.stack([np.cos(t), np.sin(t)], 1)
-    return r.centre + unit * bend + np.sign(unit) * (half - bend)
+    return rect.centre + unit * bend + np.sign(unit) * (half - bend)
 
 
 def circle(centre: np.ndarray, radius: float, sides: int = 16) -> np.ndarray:
@@ -87,7 +87,7 @@ def circle(centre: np.ndarray, radius: float, sides: int = 16) -> np.ndarray:
 
 
 def prism(outline: np.ndarray, axis: int, lo: float, hi: float) -> Mesh:
-    return loft([place(outline, axis, lo), place(outline, axis, hi)])
+    return loft([ring_at(outline, axis, lo), ring_at(outline, axis, hi)])
 
 
 def box(lo: tuple | np.ndarray, hi: tuple | np.ndarray) -> Mesh:
@@ -98,13 +98,15 @@ def board(r: Rect, z0: float, z1: float) -> Mesh:
     return box((r.x0, r.y0, z0), (r.x1, r.y1, z1))
 
 
-def lathe(profile: list[tuple[float, float]], centre: np.ndarray, axis: int, closed: bool = False, sides=20) -> Mesh:
+def lathe(
+    profile: list[tuple[float, float]], centre: np.ndarray, axis: int, closed: bool = False, sides: int = 20
+) -> Mesh:
     """Revolve (radius, height) pairs about an axis through `centre` [3]; heights count from the centre.
 
     A closed profile is a tube's cross-section. The open kind needs radii above 0.
     """
     flat = np.delete(centre, axis)
-    return loft([place(circle(flat, r, sides), axis, centre[axis] + h) for r, h in profile], closed)
+    return loft([ring_at(circle(flat, r, sides), axis, centre[axis] + h) for r, h in profile], closed)
 
 
 def rod(a: np.ndarray | list, b: np.ndarray | list, radius: float, sides: int = 10) -> Mesh:
@@ -130,25 +132,33 @@ def sweep(path: np.ndarray, across: float, deep: float, sides: int = 8) -> Mesh:
     )
 
 
-def plate(r: Rect, hole: np.ndarray, axis: int, lo: float, hi: float) -> Mesh:
+def plate(rect: Rect, hole: np.ndarray, axis: int, lo: float, hi: float) -> Mesh:
     """A rectangular plate with a hole; the hole's outline [k, 2], k a multiple of 8, starts on the +x side."""
     t = 2 * np.pi * np.arange(len(hole)) / len(hole)
     unit = np.stack([np.cos(t), np.sin(t)], 1)
-    outline = r.centre + unit / np.abs(unit).max(1, keepdims=True) * [r.width / 2, r.height / 2]
+    outline = rect.centre + unit / np.abs(unit).max(1, keepdims=True) * [rect.width / 2, rect.height / 2]
     return _pierced(outline, hole, axis, lo, hi)
 
 
-def frame(r: Rect, hole: Rect, axis: int, lo: float, hi: float) -> Mesh:
+def frame(rect: Rect, hole: Rect, axis: int, lo: float, hi: float) -> Mesh:
     """A rectangular plate with a rectangular hole."""
-    return _pierced(corners(r), corners(hole), axis, lo, hi)
+    return _pierced(corners(rect), corners(hole), axis, lo, hi)
 
 
 def _pierced(outer: np.ndarray, inner: np.ndarray, axis: int, lo: float, hi: float) -> Mesh:
-    return loft([place(outer, axis, lo), place(outer, axis, hi), place(inner, axis, hi), place(inner, axis, lo)], True)
+    return loft(
+        [ring_at(outer, axis, lo), ring_at(outer, axis, hi), ring_at(inner, axis, hi), ring_at(inner, axis, lo)], True
+    )
 
 
-def tub(r: Rect, hole: Rect, z0: float, floor: float, z1: float, radius: float = 0.0) -> Mesh:
-    """A block from z0 to z1 with a pocket, open towards +z, down to z = floor. radius: of its outer edges."""
-    outer = rounded(r, radius) if radius else corners(r)
+def hollow_block(
+    rect: Rect, hole: Rect, lo: float, floor: float, hi: float, *, radius: float = 0.0, axis: int = 2
+) -> Mesh:
+    """A block from lo to hi along an axis, with a pocket that is open at hi and reaches to floor.
+
+    rect, hole: outlines in the other two axes. lo may be above hi: the pocket is then open downwards. radius: of the
+    outer edges.
+    """
+    outer = rounded(rect, radius) if radius else corners(rect)
     inner = rounded(hole, 0.004) if radius else corners(hole)
-    return loft([place(outer, 2, z0), place(outer, 2, z1), place(inner, 2, z1), place(inner, 2, floor)])
+    return loft([ring_at(ring, axis, at) for ring, at in ((outer, lo), (outer, hi), (inner, hi), (inner, floor))])

@@ -9,21 +9,19 @@ import numpy as np
 import pytest
 import trimesh
 import yourdfpy
+from penetration import penetration_depth, posed
 
 from conversion.partnet import PartNetObject, parts, read_object
-from mjcf_assets.furniture import Joint, Link, Style, porthole, turned
-from mjcf_assets.generator import (
-    CYCLE,
-    TRAINING,
-    GeneratorError,
-    generate,
-    microwave,
-    refrigerator,
-    storage_furniture,
-)
-from mjcf_assets.solids import Mesh, Rect, box
+from mjcf_assets.output_folder import GeneratorError
+from mjcf_assets.procedural.categories import CATEGORIES, Category
+from mjcf_assets.procedural.categories.appliances import microwave, refrigerator
+from mjcf_assets.procedural.categories.storage import storage_furniture
+from mjcf_assets.procedural.components import Joint, Link, Style, porthole, rotate_about_y
+from mjcf_assets.procedural.generate import CYCLE, generate
+from mjcf_assets.procedural.solids import Mesh, Rect, box
 
 COUNT = 60
+TRAINING = {name for name in CYCLE if CATEGORIES[name].test_shape_every}
 
 
 @pytest.fixture(scope="module")
@@ -40,8 +38,8 @@ def objects(folder) -> list[PartNetObject]:
 
 def test_every_category_has_objects_and_training_categories_have_test_shapes(folder):
     splits = json.loads((folder / "splits.json").read_text())
-    assert set(splits["train"]) == set(splits["test_shapes"]) == set(TRAINING)
-    assert set(splits["test_categories"]) == set(CYCLE) - set(TRAINING)
+    assert set(splits["train"]) == set(splits["test_shapes"]) == TRAINING
+    assert set(splits["test_categories"]) == set(CYCLE) - TRAINING
     ids = [i for split in splits.values() for group in split.values() for i in group]
     assert sorted(ids) == sorted(p.name for p in folder.glob("9*")) and len(set(ids)) == COUNT
 
@@ -68,8 +66,8 @@ def test_object_depends_on_seed_and_index_alone(folder, tmp_path):
         for file in (tmp_path / "a" / name).rglob("*.*"):
             assert file.read_bytes() == (folder / name / file.relative_to(tmp_path / "a" / name)).read_bytes()
     other = generate(tmp_path / "b", 1, seed=1)[0]
-    text = (tmp_path / "b" / other / "mobility.urdf").read_text()
-    assert text.split("\n", 2)[2] != (folder / ids[0] / "mobility.urdf").read_text().split("\n", 2)[2]
+    urdf = (tmp_path / "b" / other / "mobility.urdf").read_text()
+    assert urdf.replace(other, ids[0]) != (folder / ids[0] / "mobility.urdf").read_text()
 
 
 def test_every_object_has_the_doors_and_drawers_it_says(folder, objects):
@@ -109,7 +107,7 @@ def test_turned_furniture_opens_where_its_front_is():
     body = Link("heavy furniture_body", "cabinet_frame")
     front = Link("slider drawer", "drawer", body, Joint(np.array([0.0, 0.5, 1]), np.array([0.0, 0, 1]), 0.4))
     front.add("drawer_front", box((-0.5, 0, 0.9), (0.5, 1, 1)))
-    turned([front, body], np.pi / 2)
+    rotate_about_y([front, body], np.pi / 2)
     np.testing.assert_allclose(front.joint.axis, [1, 0, 0], atol=1e-12)
     np.testing.assert_allclose(front.joint.origin, [1, 0.5, 0], atol=1e-12)
     np.testing.assert_allclose(front.leaves[0][1][0].vertices.mean(0), [0.95, 0.5, 0], atol=1e-12)
@@ -140,19 +138,16 @@ def test_parts_swing_free(objects):
             moving = set(obj.subtree(part.link))
             for share in (0.0, 0.1, 0.5, 1.0):
                 poses = obj.link_poses({part.joint: part.closed + part.sign * share * part.width})
-                at = lambda k, v, poses=poses: v.vertices @ poses[k][:3, :3].T + poses[k][:3, 3]
-                points = np.concatenate([at(k, v) for k in moving for v in obj.links[k].visuals])
+                points = np.concatenate([posed(v.vertices, poses[k]) for k in moving for v in obj.links[k].visuals])
                 for k, link in obj.links.items():
                     for v in link.visuals if k not in moving else ():
-                        assert _depth(points, Mesh(at(k, v), v.faces)) < 3e-3, (obj.id, part.link, share, k, v.name)
-
-
-def _depth(points: np.ndarray, mesh: Mesh) -> float:
-    """How far the deepest of the points [n, 3] lies inside a mesh."""
-    solid = trimesh.Trimesh(mesh.vertices, mesh.faces, process=False)
-    near = points[((points > solid.bounds[0]) & (points < solid.bounds[1])).all(1)]
-    inside = near[solid.contains(near)] if len(near) else near
-    return trimesh.proximity.closest_point(solid, inside)[1].max() if len(inside) else 0.0
+                        assert penetration_depth(points, Mesh(posed(v.vertices, poses[k]), v.faces)) < 3e-3, (
+                            obj.id,
+                            part.link,
+                            share,
+                            k,
+                            v.name,
+                        )
 
 
 @pytest.mark.parametrize("side", ["left", "right", "bottom", "top"])
@@ -161,8 +156,8 @@ def test_portholes_are_closed_meshes_that_swing_free_of_their_panel(side):
     hollow = 0
     for seed in range(20):
         rng = np.random.default_rng(seed)
-        style, body = Style.draw(rng, {"bar": 1, "none": 1}, {"slab": 1}), Link("heavy body", "frame")
-        link = porthole(rng, style, body, cell, 0.5, side, "leaf")
+        style, body = Style.sample(rng, {"bar": 1, "none": 1}, {"slab": 1}), Link("heavy body", "frame")
+        link = porthole(rng, style, body, cell, z=0.5, side=side, leaf="leaf")
         (panel,), (leaf,) = body.leaves[0][1], link.leaves[0][1]
         for mesh in (panel, leaf):
             solid = trimesh.Trimesh(mesh.vertices, mesh.faces)
@@ -170,7 +165,7 @@ def test_portholes_are_closed_meshes_that_swing_free_of_their_panel(side):
         hollow += np.ptp(leaf.vertices[:, 2]) > style.front + 1e-9
         for q in np.linspace(0, 1, 9) * link.joint.upper:
             turn = trimesh.transformations.rotation_matrix(q, link.joint.axis, link.joint.origin)
-            assert _depth(trimesh.transform_points(leaf.vertices, turn), panel) < 3e-3, (seed, q)
+            assert penetration_depth(trimesh.transform_points(leaf.vertices, turn), panel) < 3e-3, (seed, q)
     assert 0 < hollow < 20
 
 
@@ -178,7 +173,7 @@ def test_portholes_are_where_the_style_has_them():
     drawn = {}
     for seed in range(60):
         rng = np.random.default_rng(seed)
-        wanted = Style.draw(np.random.default_rng(seed), {"bar": 1}, {"slab": 1}).porthole
+        wanted = Style.sample(np.random.default_rng(seed), {"bar": 1}, {"slab": 1}).porthole
         body = storage_furniture(rng)[-1]
         drawn.setdefault(wanted, []).append(any(name == "frame" for name, _ in body.leaves))
     assert all(drawn[True]) and not any(drawn[False]) and len(drawn[True]) > 3
@@ -187,7 +182,7 @@ def test_portholes_are_where_the_style_has_them():
 def test_fronts_are_boards_or_sheets():
     drawn = {False: 0, True: 0}
     for seed in range(40):
-        style = Style.draw(np.random.default_rng(seed), {"bar": 1}, {"slab": 1})
+        style = Style.sample(np.random.default_rng(seed), {"bar": 1}, {"slab": 1})
         for maker in (refrigerator, microwave):
             link = next(x for x in maker(np.random.default_rng(seed)) if x.name == "door")
             if style.porthole and maker is microwave:
@@ -211,3 +206,42 @@ def test_a_folder_of_other_objects_is_left_alone(tmp_path):
     with pytest.raises(GeneratorError, match=r"holds other objects \(45194"):
         generate(tmp_path, 2, 0)
     assert [p.name for p in tmp_path.iterdir()] == ["45194"]
+
+
+def test_a_set_of_chosen_categories_shares_no_id_with_the_cycle_and_does_not_depend_on_the_others(tmp_path):
+    generate(tmp_path / "a", 6, seed=0, categories=["Safe", "Box"])
+    generate(tmp_path / "b", 3, seed=0, categories=["Box"])
+    ids = {p.name for p in (tmp_path / "a").glob("8*")}
+    assert len(ids) == 6
+    splits = json.loads((tmp_path / "a" / "splits.json").read_text())
+    assert len(splits["test_categories"]["Safe"]) == 3
+    assert sorted(splits["train"]["Box"] + splits["test_shapes"]["Box"]) == sorted(
+        ids - {*splits["test_categories"]["Safe"]}
+    )
+    for file in (tmp_path / "b").glob("8*/**/*.*"):
+        assert file.read_bytes() == (tmp_path / "a" / file.relative_to(tmp_path / "b")).read_bytes()
+
+
+def test_numbers_of_categories_are_unique_and_only_the_papers_are_in_the_cycle():
+    numbers = [category.number for category in CATEGORIES.values()]
+    assert len(set(numbers)) == len(numbers) and all(1 <= n < 100 for n in numbers)
+    assert set(CATEGORIES) - set(CYCLE) == {"Box"}
+
+
+def test_a_new_category_is_a_function_and_an_entry(tmp_path, monkeypatch):
+    def cube(rng: np.random.Generator) -> list[Link]:
+        body = Link("heavy cube", "cube")
+        body.add("cube", box((0, 0, 0), (1, 1, rng.uniform(1, 2))))
+        return [body]
+
+    monkeypatch.setitem(CATEGORIES, "Cube", Category(cube, number=99, test_shape_every=2))
+    ids = generate(tmp_path, 2, seed=0, categories=["Cube"])
+    assert json.loads((tmp_path / "splits.json").read_text())["test_shapes"] == {"Cube": [ids[1]]}
+    assert (tmp_path / ids[0] / "semantics.txt").read_text() == "link_0 heavy cube\n"
+
+
+@pytest.mark.parametrize("categories", [[], ["Sofa"], "Box"])
+def test_unknown_categories_are_refused(tmp_path, categories):
+    with pytest.raises(GeneratorError, match="expected some of StorageFurniture"):
+        generate(tmp_path / "out", 2, 0, categories)
+    assert not (tmp_path / "out").exists()
