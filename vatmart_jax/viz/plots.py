@@ -40,9 +40,9 @@ def curves(rows: Sequence[dict[str, Any]], out: Path) -> None:
     ]
     panels = [(stage, name, points) for stage, name, points in panels if points]
     columns = 4
-    rows = -(-len(panels) // columns)
-    figure = Figure(figsize=(14, 2.6 * rows))
-    axes = figure.subplots(rows, columns)
+    lines = -(-len(panels) // columns)
+    figure = Figure(figsize=(14, 2.6 * lines))
+    axes = figure.subplots(lines, columns)
     for axis, (stage, name, points) in zip(np.ravel(axes), panels, strict=False):
         axis.plot(*zip(*points, strict=True), marker="." if len(points) < 20 else None)
         axis.set_title(f"{stage}: {name}", fontsize=9)
