@@ -12,7 +12,7 @@ from conversion.boxes import CORNERS, boxes
 from conversion.decompose import DecomposeConfig, Surface, fidelity, merged
 from conversion.partnet import ConvertedObject, Hull, Visual
 from conversion.scenes import Placement, other_values, placements
-from vatmart_jax.bank import SceneBank
+from vatmart_jax.data.banks import SceneBank
 
 Row = tuple[int, np.ndarray, np.ndarray, bool]  # shape, position [3], quaternion [4] wxyz, is a handle's
 

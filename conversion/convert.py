@@ -38,8 +38,8 @@ from conversion.report import contact_sheet, page, picture, read_png, save_png
 from conversion.scenes import scene_bank
 from conversion.textures import read_mtl
 from conversion.views import views
-from vatmart_jax.bank import SceneBank
-from vatmart_jax.files import whole_folder, write_json, write_text
+from vatmart_jax.atomic_io import whole_folder, write_json, write_text
+from vatmart_jax.data.banks import SceneBank
 
 URDF_NAMES = ("mobility.urdf", "mobility_vhacd.urdf")
 TRAIN_CATEGORIES = ("StorageFurniture", "Door", "Microwave", "Refrigerator")  # paper, section 4.1

@@ -25,8 +25,8 @@ from scipy.spatial.transform import Rotation
 from trimesh.ray.ray_pyembree import RayMeshIntersector
 
 from conversion.textures import Material, Skin, read_mtl, read_png
+from vatmart_jax.atomic_io import whole
 from vatmart_jax.errors import UserError
-from vatmart_jax.files import whole
 
 MAX_COORDINATE = 1e3  # objects are normalised to about 2 unit lengths; anything near this is damage
 MAX_FILE_BYTES = 256 * 2**20

@@ -15,7 +15,7 @@ from scipy.spatial import ConvexHull
 from trimesh.ray.ray_pyembree import RayMeshIntersector
 
 from conversion.partnet import ConvertedObject, PartNetObject
-from vatmart_jax.files import whole
+from vatmart_jax.atomic_io import whole
 
 _LIGHT = np.array([-0.5, 0.35, 0.8]) / np.linalg.norm([-0.5, 0.35, 0.8])
 _PALETTE = np.array(

@@ -12,7 +12,7 @@ from scipy.spatial import ConvexHull
 from scipy.spatial.transform import Rotation
 
 from conversion.partnet import ConvertedObject, Hull, ObjectError, Part
-from vatmart_jax.bank import HINGE, SLIDE, SceneBank
+from vatmart_jax.data.banks import HINGE, SLIDE, SceneBank
 
 SWEEP = np.linspace(0.0, 1.0, 9)  # shares of a part's range at which neighbours must leave it room
 ROOM = 2e-3  # unit lengths; hulls may overlap this much more than with everything closed

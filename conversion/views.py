@@ -15,7 +15,7 @@ from trimesh.ray.ray_pyembree import RayMeshIntersector
 
 from conversion.partnet import ConvertedObject, ObjectError, Part
 from conversion.scenes import Placement, instances, other_values, placements, rng_of
-from vatmart_jax.bank import HINGE, SLIDE, SceneBank, ViewBank
+from vatmart_jax.data.banks import HINGE, SLIDE, SceneBank, ViewBank
 
 # The paper's appendix (settings of Where2Act): where the camera stands and what it sees.
 DISTANCE = 5.0  # from the object's centre, unit lengths

@@ -36,7 +36,7 @@ from conversion.mjcf import VISUAL_GROUP
 from conversion.partnet import ConvertedObject, Visual
 from conversion.scenes import other_values
 from conversion.views import DISTANCE, views
-from vatmart_jax.bank import SceneBank
+from vatmart_jax.data.banks import SceneBank
 
 RESULTS = Path(__file__).parent / "results" / "conversion.json"
 

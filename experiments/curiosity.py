@@ -15,15 +15,15 @@ from typing import Any
 
 import tyro
 
-from vatmart_jax.data import Data
+from vatmart_jax.atomic_io import write_json
+from vatmart_jax.data.dataset import Data
 from vatmart_jax.errors import UserError, at_least_one, one_of
 from vatmart_jax.evaluation.metrics import wilson_interval
-from vatmart_jax.files import write_json
-from vatmart_jax.physics.interface import default_impl
-from vatmart_jax.pipeline.run import read_config, read_metrics
-from vatmart_jax.presets import PRESETS
-from vatmart_jax.progress import Bars
-from vatmart_jax.training import resolve, train
+from vatmart_jax.physics.types import default_impl
+from vatmart_jax.pipeline.presets import PRESETS
+from vatmart_jax.pipeline.run_dir import read_config, read_metrics
+from vatmart_jax.reporting import Bars
+from vatmart_jax.workflows.train import resolve, train
 
 
 @dataclass(frozen=True)

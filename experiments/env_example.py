@@ -12,10 +12,10 @@ import jax
 import jax.numpy as jnp
 import tyro
 
-from vatmart_jax.bank import SceneBank, ViewBank
-from vatmart_jax.env import ACTION, TASKS, Env, EnvConfig
-from vatmart_jax.expert import expert_action
-from vatmart_jax.geometry import WAYPOINTS
+from vatmart_jax.data.banks import SceneBank, ViewBank
+from vatmart_jax.envs.env import ACTION, TASKS, Env, EnvConfig
+from vatmart_jax.envs.scripted_policy import expert_action
+from vatmart_jax.trajectory import WAYPOINTS
 
 
 @dataclass(frozen=True)

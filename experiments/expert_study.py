@@ -12,14 +12,14 @@ import jax
 import numpy as np
 import tyro
 
-from vatmart_jax.data import Data
-from vatmart_jax.env import TASKS, Env, EnvConfig
+from vatmart_jax.atomic_io import write_json
+from vatmart_jax.data.dataset import Data
+from vatmart_jax.envs.env import TASKS, Env, EnvConfig
+from vatmart_jax.envs.scripted_policy import expert_action, expert_start
 from vatmart_jax.evaluation.metrics import wilson_interval
-from vatmart_jax.expert import expert_action, expert_start
-from vatmart_jax.files import write_json
-from vatmart_jax.geometry import WAYPOINTS
 from vatmart_jax.physics import PhysicsConfig
-from vatmart_jax.physics.template import FINGER_OPEN, FINGERS
+from vatmart_jax.physics.scene_model import FINGER_OPEN, FINGERS
+from vatmart_jax.trajectory import WAYPOINTS
 
 
 @dataclass(frozen=True)

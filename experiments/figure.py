@@ -16,13 +16,13 @@ import numpy as np
 import tyro
 from PIL import Image
 
-from vatmart_jax.bank import SceneBank, ViewBank
-from vatmart_jax.env import TASKS, Env
-from vatmart_jax.files import whole
-from vatmart_jax.inference import Priors
-from vatmart_jax.pipeline import pictures
-from vatmart_jax.play import animate, find_scene, play
-from vatmart_jax.pretrained import run_folder
+from vatmart_jax.atomic_io import whole
+from vatmart_jax.data.banks import SceneBank, ViewBank
+from vatmart_jax.envs.env import TASKS, Env
+from vatmart_jax.priors.pretrained import run_folder
+from vatmart_jax.priors.priors import Priors
+from vatmart_jax.viz import plots
+from vatmart_jax.viz.trial_video import animate, find_scene, play
 
 MOMENTS = (0.0, 0.35, 0.6, 1.0)  # of the trial
 
@@ -62,7 +62,7 @@ def main(args: Figure) -> None:
         moved = result["moved"] if priors.config.task.endswith("drawer") else np.degrees(result["moved"])
         with tempfile.TemporaryDirectory() as folder:
             heat, film = Path(folder) / "heat.png", Path(folder) / "trial.gif"
-            pictures.priors(
+            plots.priors(
                 points, mask, np.asarray(found.actionability), found.contact, np.asarray(found.trajectories[:3]),
                 np.asarray(found.scores[:3]), (float(env.views.azimuth[view]), float(env.views.elevation[view])),
                 f"{priors.config.task} by {asked}", heat, env.config.standoff,

@@ -19,19 +19,19 @@ import jax
 import jax.numpy as jnp
 import tyro
 
+from vatmart_jax.atomic_io import write_json
 from vatmart_jax.config import from_json, to_json
-from vatmart_jax.data import Data
-from vatmart_jax.env import TASKS
+from vatmart_jax.data.dataset import Data
+from vatmart_jax.envs.env import TASKS
 from vatmart_jax.errors import UserError
-from vatmart_jax.evaluation.evaluate import evaluate_split
-from vatmart_jax.files import write_json
-from vatmart_jax.inference import Priors
-from vatmart_jax.physics.interface import default_impl
-from vatmart_jax.pipeline.run import Run, read_config
-from vatmart_jax.pipeline.train import STAGES, Training, run_seconds
-from vatmart_jax.presets import Settings
-from vatmart_jax.progress import Bars
-from vatmart_jax.training import environments, priors_config
+from vatmart_jax.physics.types import default_impl
+from vatmart_jax.pipeline.presets import Settings
+from vatmart_jax.pipeline.run_dir import Run, read_config
+from vatmart_jax.pipeline.trainer import STAGES, Training, run_seconds
+from vatmart_jax.priors.priors import Priors
+from vatmart_jax.reporting import Bars
+from vatmart_jax.workflows.evaluate import evaluate_split
+from vatmart_jax.workflows.train import environments, priors_config
 
 
 @dataclass(frozen=True)

@@ -19,16 +19,16 @@ import mujoco
 import numpy as np
 import tyro
 
-from vatmart_jax import geometry as g
-from vatmart_jax.bank import SceneBank, ViewBank
-from vatmart_jax.bench import Choice, device, random_trials
-from vatmart_jax.env import TASKS, Env, EnvConfig, EnvState, Start
-from vatmart_jax.expert import run_expert
-from vatmart_jax.files import write_json
+from vatmart_jax.atomic_io import write_json
+from vatmart_jax.bench.benchmarks import Choice, device, random_trials
+from vatmart_jax.data.banks import SceneBank, ViewBank
+from vatmart_jax.envs.env import TASKS, Env, EnvConfig, EnvState, Start
+from vatmart_jax.envs.scripted_policy import run_expert
 from vatmart_jax.physics import PhysicsConfig
 from vatmart_jax.physics.controller import waypoint_controls
-from vatmart_jax.physics.template import HAND, N_CTRL, PART, scene_model
-from vatmart_jax.pipeline.explore import start_pool
+from vatmart_jax.physics.scene_model import HAND, N_CTRL, PART, scene_model
+from vatmart_jax.pipeline.exploration import start_pool
+from vatmart_jax.trajectory import WAYPOINTS
 
 
 @dataclass(frozen=True)
@@ -60,7 +60,7 @@ def time_step(env: Env, finer: Env, start: Start, residuals: jax.Array) -> dict[
 def uniform_residuals(env: Env, n: int, key: jax.Array) -> jax.Array:
     """[n, 4, 6] anything the action space allows, each axis on its own."""
     limits = jnp.array([env.config.move_range] * 3 + [env.config.turn_range] * 3)
-    return jax.random.uniform(key, (n, g.WAYPOINTS, 6), minval=-1.0) * limits
+    return jax.random.uniform(key, (n, WAYPOINTS, 6), minval=-1.0) * limits
 
 
 def tracking(env: Env, n: int, key: jax.Array) -> dict[str, float]:
@@ -103,7 +103,7 @@ def coasting(env: Env, final: EnvState) -> dict[str, float]:
 def pressing(env: Env, start: Start, trials: int) -> dict[str, float]:
     """The hand presses straight on, 1 unit past the contact: how deep it gets into anything, and the joint past its
     limit. From the contacts that plain MuJoCo finds at the end."""
-    residuals = jnp.zeros((len(start.view), g.WAYPOINTS, 6)).at[:, :, :3].set(0.25 * start.rotation[:, None, :, 2])
+    residuals = jnp.zeros((len(start.view), WAYPOINTS, 6)).at[:, :, :3].set(0.25 * start.rotation[:, None, :, 2])
     final = jax.device_get(jax.jit(env.execute)(start, residuals))
     depth, past = [], []
     models: dict[int, mujoco.MjModel] = {}

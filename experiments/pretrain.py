@@ -11,9 +11,9 @@ from pathlib import Path
 import tyro
 
 from vatmart_jax import pretrained
-from vatmart_jax.files import whole_folder, write_json
-from vatmart_jax.inference import Priors
-from vatmart_jax.pipeline.run import read_config, read_metrics
+from vatmart_jax.atomic_io import whole_folder, write_json
+from vatmart_jax.pipeline.run_dir import read_config, read_metrics
+from vatmart_jax.priors.priors import Priors
 
 RESULTS = Path(__file__).parent / "results"
 

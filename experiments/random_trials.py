@@ -16,10 +16,10 @@ import jax.numpy as jnp
 import numpy as np
 import tyro
 
-from vatmart_jax.bank import SceneBank, ViewBank
-from vatmart_jax.env import ACTION, TASKS, Env, EnvConfig
-from vatmart_jax.files import write_json
-from vatmart_jax.geometry import WAYPOINTS
+from vatmart_jax.atomic_io import write_json
+from vatmart_jax.data.banks import SceneBank, ViewBank
+from vatmart_jax.envs.env import ACTION, TASKS, Env, EnvConfig
+from vatmart_jax.trajectory import WAYPOINTS
 
 
 @dataclass(frozen=True)

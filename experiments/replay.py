@@ -13,17 +13,17 @@ import jax
 import jax.numpy as jnp
 import tyro
 
-from vatmart_jax import geometry as g
+from vatmart_jax.atomic_io import write_json
 from vatmart_jax.config import from_json
-from vatmart_jax.data import Data
-from vatmart_jax.env import TASKS, Env, Start
-from vatmart_jax.evaluation.evaluate import load_policy
-from vatmart_jax.files import write_json
-from vatmart_jax.pipeline.collect import samples_of
-from vatmart_jax.pipeline.explore import Explorer
-from vatmart_jax.pipeline.run import read_config
-from vatmart_jax.presets import Settings
-from vatmart_jax.pretrained import run_folder
+from vatmart_jax.data.dataset import Data
+from vatmart_jax.envs.env import TASKS, Env, Start
+from vatmart_jax.pipeline.exploration import Explorer
+from vatmart_jax.pipeline.presets import Settings
+from vatmart_jax.pipeline.proposal_rollouts import samples_of
+from vatmart_jax.pipeline.run_dir import read_config
+from vatmart_jax.priors.pretrained import run_folder
+from vatmart_jax.trajectory import unpack_trajectory
+from vatmart_jax.workflows.evaluate import load_policy
 
 
 @dataclass(frozen=True)
@@ -64,7 +64,7 @@ def study(args: Replay, env: Env, explorer: Explorer, policy: Any) -> dict[str, 
 
     @jax.jit
     def again(start: Start, trajectory: jax.Array) -> jax.Array:
-        rotation, residuals = g.unpack_trajectory(trajectory)
+        rotation, residuals = unpack_trajectory(trajectory)
         return samples_of(env.execute(start.replace(rotation=rotation), residuals), trajectory).success(tolerance)
 
     successes, wins, distances = 0, Counter[str](), []

@@ -44,8 +44,8 @@ from mjcf_assets.solids import (
     sweep,
     tub,
 )  # fmt: skip
+from vatmart_jax.atomic_io import whole_folder, write_text
 from vatmart_jax.errors import UserError
-from vatmart_jax.files import whole_folder, write_text
 
 # The order in which categories come: each of them early, and in proportions like those of the real set.
 CYCLE = (

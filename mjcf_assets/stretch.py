@@ -15,7 +15,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from mjcf_assets.generator import GeneratorError, make_folder
-from vatmart_jax.files import whole_folder, write_text
+from vatmart_jax.atomic_io import whole_folder, write_text
 
 LIMIT = 0.35  # of the logarithm of a length's factor
 _ASKEW = 0.02  # sine of the angle by which a frame may be off its parent's axes

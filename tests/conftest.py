@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from vatmart_jax.bank import HINGE, SLIDE, SceneBank, ViewBank
+from vatmart_jax.data.banks import HINGE, SLIDE, SceneBank, ViewBank
 
 # Compiled programs are kept between runs; in the environment, so that commands which tests start keep them too.
 _CACHE = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "vatmart_jax" / "xla"

@@ -6,9 +6,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from vatmart_jax.perception.clouds import Clouds
+from vatmart_jax.perception.grouped_views import Clouds
 from vatmart_jax.perception.pointnet2 import PointNetConfig, group
-from vatmart_jax.perception.train import Samples
+from vatmart_jax.perception.trainer import Samples
 
 
 def boxes(seed: int, views: int, config: PointNetConfig, contacts: int = 32) -> tuple[Clouds, np.ndarray]:

@@ -21,7 +21,7 @@ from conversion.handles import handles
 from conversion.partnet import ConvertedObject, ObjectError
 from conversion.scenes import scene_bank
 from mjcf_assets.generator import generate
-from vatmart_jax.bank import SceneBank, ViewBank
+from vatmart_jax.data.banks import SceneBank, ViewBank
 
 QUICK = ConvertConfig(views=1, points=64, contacts=16, variants=2)
 

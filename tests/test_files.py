@@ -1,6 +1,6 @@
 import pytest
 
-from vatmart_jax.files import whole, whole_folder
+from vatmart_jax.atomic_io import whole, whole_folder
 
 
 def test_a_file_is_there_complete_or_stays_as_it_was(tmp_path):

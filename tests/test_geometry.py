@@ -7,19 +7,20 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from scipy.spatial.transform import Rotation
 
-from vatmart_jax import geometry as g
+from vatmart_jax import rotations as rot
+from vatmart_jax.trajectory import WAYPOINTS, min_jerk, pack_trajectory, unpack_trajectory
 
 PROPERTY = settings(deadline=None, max_examples=60)
 unit = arrays(np.float64, 3, elements=st.floats(-1, 1)).filter(lambda v: np.linalg.norm(v) > 0.1)
 angle = st.one_of(st.floats(0, np.pi), st.floats(np.pi - 1e-3, np.pi), st.floats(0, 1e-3))
 angles = arrays(np.float64, 3, elements=st.floats(-np.pi, np.pi))
 
-matrix_from_quat, quat_from_matrix = jax.jit(g.matrix_from_quat), jax.jit(g.quat_from_matrix)
-matrix_from_rotvec, rotvec_from_matrix = jax.jit(g.matrix_from_rotvec), jax.jit(g.rotvec_from_matrix)
-matrix_from_euler, euler_from_matrix = jax.jit(g.matrix_from_euler), jax.jit(g.euler_from_matrix)
-matrix_from_rot6d = jax.jit(g.matrix_from_rot6d)
-cone_direction = jax.jit(g.cone_direction)
-pack_trajectory, unpack_trajectory = jax.jit(g.pack_trajectory), jax.jit(g.unpack_trajectory)
+matrix_from_quat, quat_from_matrix = jax.jit(rot.matrix_from_quat), jax.jit(rot.quat_from_matrix)
+matrix_from_rotvec, rotvec_from_matrix = jax.jit(rot.matrix_from_rotvec), jax.jit(rot.rotvec_from_matrix)
+matrix_from_euler, euler_from_matrix = jax.jit(rot.matrix_from_euler), jax.jit(rot.euler_from_matrix)
+matrix_from_rot6d = jax.jit(rot.matrix_from_rot6d)
+cone_direction = jax.jit(rot.cone_direction)
+pack_trajectory, unpack_trajectory = jax.jit(pack_trajectory), jax.jit(unpack_trajectory)
 
 
 def rotvec(axis, angle) -> np.ndarray:
@@ -83,21 +84,21 @@ def test_rot6d_of_any_two_directions_is_a_right_handed_frame_with_up_kept(up, fo
     assert_same(frame.T @ frame, np.eye(3), 1e-5)
     assert_same(np.linalg.det(frame), 1, 1e-5)
     assert_same(frame[:, 2], up / np.linalg.norm(up), 1e-5)
-    assert_same(matrix_from_rot6d(g.rot6d_from_matrix(jnp.asarray(frame))), frame, 1e-5)
+    assert_same(matrix_from_rot6d(rot.rot6d_from_matrix(jnp.asarray(frame))), frame, 1e-5)
 
 
 def test_gradients_at_zero_are_finite_and_right():
-    jacobian = jax.jit(jax.jacobian(g.matrix_from_rotvec))(jnp.zeros(3))
-    assert_same(jacobian, np.moveaxis(g.cross_matrix(jnp.eye(3)), 0, -1))
-    assert np.isfinite(jax.jit(jax.jacobian(g.normalize))(jnp.zeros(3))).all()
-    assert np.isfinite(jax.jit(jax.jacobian(g.matrix_from_rot6d))(jnp.zeros(6))).all()
+    jacobian = jax.jit(jax.jacobian(rot.matrix_from_rotvec))(jnp.zeros(3))
+    assert_same(jacobian, np.moveaxis(rot.cross_matrix(jnp.eye(3)), 0, -1))
+    assert np.isfinite(jax.jit(jax.jacobian(rot.normalize))(jnp.zeros(3))).all()
+    assert np.isfinite(jax.jit(jax.jacobian(rot.matrix_from_rot6d))(jnp.zeros(6))).all()
 
 
 def test_rotate_and_unrotate_are_products_with_a_matrix_and_its_transpose():
     m, v = Rotation.random(5, random_state=0).as_matrix(), np.random.default_rng(0).normal(size=(5, 3))
-    assert_same(g.rotate(jnp.asarray(m), jnp.asarray(v)), (m @ v[..., None])[..., 0])
-    assert_same(g.unrotate(jnp.asarray(m), g.rotate(jnp.asarray(m), jnp.asarray(v))), v)
-    assert_same(g.cross_matrix(jnp.asarray(v)) @ jnp.asarray(v)[..., None], 0)
+    assert_same(rot.rotate(jnp.asarray(m), jnp.asarray(v)), (m @ v[..., None])[..., 0])
+    assert_same(rot.unrotate(jnp.asarray(m), rot.rotate(jnp.asarray(m), jnp.asarray(v))), v)
+    assert_same(rot.cross_matrix(jnp.asarray(v)) @ jnp.asarray(v)[..., None], 0)
 
 
 @pytest.mark.parametrize("half_angle_deg", [10, 30, 90])
@@ -117,19 +118,19 @@ def test_cone_directions_are_uniform_on_the_cap(half_angle_deg):
 
 def test_min_jerk_starts_and_stops_at_rest():
     u = jnp.linspace(-0.5, 1.5, 41)
-    s = g.min_jerk(u)
+    s = min_jerk(u)
     assert_same(s[u <= 0], 0)
     assert_same(s[u >= 1], 1)
     assert (np.diff(s) >= 0).all()
     ends = jnp.array([1e-4, 1 - 1e-4])
-    assert_same(jax.jit(jax.vmap(jax.grad(g.min_jerk)))(ends), 0, 1e-3)
-    assert_same(jax.jit(jax.vmap(jax.grad(jax.grad(g.min_jerk))))(ends), 0, 1e-2)
+    assert_same(jax.jit(jax.vmap(jax.grad(min_jerk)))(ends), 0, 1e-3)
+    assert_same(jax.jit(jax.vmap(jax.grad(jax.grad(min_jerk))))(ends), 0, 1e-2)
 
 
 def test_trajectories_are_30_numbers_that_unpack_to_what_was_packed():
     rng = np.random.default_rng(0)
     frames = jnp.asarray(Rotation.random(6, random_state=0).as_matrix().reshape(2, 3, 3, 3), jnp.float32)
-    residuals = jnp.asarray(rng.normal(size=(2, 3, g.WAYPOINTS, 6)), jnp.float32)
+    residuals = jnp.asarray(rng.normal(size=(2, 3, WAYPOINTS, 6)), jnp.float32)
     packed = pack_trajectory(frames, residuals)
     assert packed.shape == (2, 3, 30)
     back_frames, back_residuals = unpack_trajectory(packed)

@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 from conversion.partnet import ConvertedObject, Hull, ObjectError
 from conversion.scenes import other_values, scene_bank
 from mjcf_assets.generator import generate
-from vatmart_jax.bank import HINGE, SLIDE, SceneBank, Scenes
+from vatmart_jax.data.banks import HINGE, SLIDE, SceneBank, Scenes
 
 # One of each quirk: ranges that exclude 0, go below it, or start past it; buttons on a door; a plain cabinet.
 REAL = ("103480", "12428", "11826", "101564", "45194", "8877")

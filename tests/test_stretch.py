@@ -15,7 +15,7 @@ from scipy.spatial import cKDTree
 from conversion.partnet import parts, read_object
 from mjcf_assets.generator import GeneratorError, generate
 from mjcf_assets.stretch import LIMIT, stretched_copies
-from vatmart_jax.cli import main
+from vatmart_jax.cli.main import main
 
 
 @pytest.fixture(scope="module")

@@ -15,7 +15,7 @@ from conversion.partnet import ConvertedObject, ObjectError
 from conversion.scenes import other_values, scene_bank
 from conversion.views import DISTANCE, TASKS, views
 from mjcf_assets.generator import generate
-from vatmart_jax.bank import SceneBank, ViewBank
+from vatmart_jax.data.banks import SceneBank, ViewBank
 
 REAL = ("45194", "101564", "7167")
 VISUALS = np.array([k == VISUAL_GROUP for k in range(6)], np.uint8)

@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import optax
 
-from vatmart_jax.geometry import since_start
+from vatmart_jax.trajectory import since_start
 
 
 def score_loss(logits: jax.Array, labels: jax.Array) -> jax.Array:

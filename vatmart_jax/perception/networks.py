@@ -15,16 +15,9 @@ import flax.linen as nn
 import jax
 import jax.numpy as jnp
 
-from vatmart_jax.geometry import (
-    TRAJECTORY,
-    WAYPOINTS,
-    carried,
-    matrix_from_rot6d,
-    normalize,
-    rot6d_from_matrix,
-    since_start,
-)
 from vatmart_jax.perception.pointnet2 import Grouping, PointNet2, PointNetConfig, Shared, surroundings
+from vatmart_jax.rotations import carried, matrix_from_rot6d, normalize, rot6d_from_matrix
+from vatmart_jax.trajectory import TRAJECTORY, WAYPOINTS, since_start
 
 Params = dict  # of the networks' names to their Flax parameters
 

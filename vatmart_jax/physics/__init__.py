@@ -4,7 +4,7 @@
 inside `jit` and `scan`, and which never recompile when scenes, poses or controls change.
 """
 
-from vatmart_jax.physics.interface import Physics, PhysicsState, make_physics
-from vatmart_jax.physics.template import PhysicsConfig
+from vatmart_jax.physics.scene_model import PhysicsConfig
+from vatmart_jax.physics.types import Physics, PhysicsState, make_physics
 
 __all__ = ["Physics", "PhysicsConfig", "PhysicsState", "make_physics"]

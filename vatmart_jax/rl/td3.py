@@ -11,7 +11,7 @@ import optax
 from flax import struct
 
 from vatmart_jax.rl.networks import Critic, Policy
-from vatmart_jax.rl.replay import Replay, Transition
+from vatmart_jax.rl.replay_buffer import Replay, Transition
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,1 @@
+"""Benchmarks: speed of physics and networks, agreement of the physics implementations."""

@@ -1,0 +1,3 @@
+from vatmart_jax.cli.main import main
+
+main()

@@ -1,0 +1,1 @@
+"""What conversion leaves for training: banks, splits, the cache."""

@@ -1,0 +1,1 @@
+"""Batched trials: tasks, starts, rewards, observations."""

@@ -1,0 +1,82 @@
+"""How good the scorer and the proposals are: labelled trajectories of the policy on objects not trained on."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from vatmart_jax.evaluation import metrics as m
+from vatmart_jax.perception.grouped_views import Clouds
+from vatmart_jax.perception.networks import Params
+from vatmart_jax.perception.predictor import Ensemble, propose_trajectories, score_trajectories
+from vatmart_jax.perception.trainer import Samples
+from vatmart_jax.pipeline.exploration import Explorer
+from vatmart_jax.pipeline.proposal_rollouts import samples_of
+
+_NOISE = 0.05  # of the policy, share of the action range: varied trajectories, most of them good
+
+
+def labelled(explorer: Explorer, policy: Any, count: int, key: jax.Array) -> tuple[Samples, Samples]:
+    """`count` positives and as many negatives of the policy, from random starts (paper, section 5.1).
+
+    A positive is a trajectory that did its task. Negatives are, half and half where there are enough, positives whose
+    task is shifted off the tolerance, and trials that failed (collisions and failed grasps among them). Consumes the
+    key. Fewer come back where the policy has too few successes in 40 batches.
+    """
+    tolerance, task = explorer.env.config.tolerance, explorer.env.task
+    good: list[Samples] = []
+    bad: list[Samples] = []
+    found = 0
+    for batch in range(40):
+        final, _ = explorer.run(policy, None, jax.random.fold_in(key, batch), _NOISE, 0.0, abandon=False)
+        samples = jax.device_get(samples_of(final))
+        success = np.asarray(samples.success(tolerance))
+        good.append(jax.tree.map(lambda a: a[success], samples))  # noqa: B023
+        bad.append(jax.tree.map(lambda a: a[~success], samples))  # noqa: B023
+        found += int(success.sum())
+        if found >= count:
+            break
+    positive, failed = (jax.tree.map(lambda *a: np.concatenate(a)[:count], *rows) for rows in (good, bad))
+    n = len(positive.view)
+    rng = np.random.default_rng(np.asarray(jax.random.key_data(key)))
+    off = np.exp(rng.choice([-1, 1], n) * rng.uniform(0.2, 1.0, n))  # a fifth to e times off, either way
+    shifted = positive.replace(task=np.clip(positive.moved * off, 0.5 * task.low, 1.5 * task.high))
+    wrong = ~np.asarray(shifted.success(tolerance))
+    shifted = jax.tree.map(lambda a: a[wrong], shifted)
+    half = min(n // 2, len(failed.view))
+    negative = jax.tree.map(lambda a, b: np.concatenate([a[:half], b[: n - half]]), failed, shifted)
+    return jax.tree.map(jnp.asarray, positive), jax.tree.map(jnp.asarray, negative)
+
+
+def priors_metrics(
+    ensemble: Ensemble,
+    params: Params,
+    clouds: Clouds,
+    positive: Samples,
+    negative: Samples,
+    key: jax.Array,
+    runs: int = 10,
+    proposals: int = 100,
+) -> dict[str, Any]:
+    """Accuracy, precision, recall, F-score and reliability of the scorer, coverage of the proposals (appendix E.1).
+
+    Coverage is the mean of `runs` draws of `proposals` trajectories per positive. Consumes the key.
+    """
+    score = lambda s: np.asarray(  # noqa: E731
+        score_trajectories(ensemble, params, clouds, s.view, s.contact, s.task, s.trajectory)
+    )
+    p, n = score(positive), score(negative)
+    labels = np.concatenate([np.ones(len(p)), np.zeros(len(n))])
+    scores = np.concatenate([p, n])
+    result = {**m.scorer_metrics(scores, labels), "reliability": m.reliability(scores, labels).to_json()}
+    covered = []
+    for run in range(runs):
+        proposed, _ = propose_trajectories(
+            ensemble, params, clouds, positive.view, positive.contact, positive.task,
+            jax.random.fold_in(key, run), proposals,
+        )  # fmt: skip
+        covered.append(m.coverage(np.asarray(proposed), np.asarray(positive.trajectory)))
+    return {**result, "coverage": float(np.mean(covered)), "positives": len(p), "negatives": len(n)}

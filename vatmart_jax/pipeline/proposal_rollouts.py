@@ -1,0 +1,88 @@
+"""Trials become samples for the perception networks: by the policy, or by the networks' own proposals."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+
+from vatmart_jax.envs.env import Env, EnvState, Start
+from vatmart_jax.perception.grouped_views import Clouds
+from vatmart_jax.perception.networks import Params
+from vatmart_jax.perception.predictor import Ensemble, explore_actions, select_actions
+from vatmart_jax.perception.trainer import Samples
+from vatmart_jax.trajectory import unpack_trajectory
+
+
+def samples_of(final: EnvState, trajectory: jax.Array | None = None) -> Samples:
+    """The samples [B] that finished trials make; `trajectory` [B, 30] where the networks proposed it."""
+    start = final.start
+    return Samples(
+        start.view,
+        start.contact,
+        start.task,
+        final.trajectory if trajectory is None else trajectory,
+        final.moved,
+        final.valid & final.held,
+        jnp.full(start.view.shape, trajectory is not None),
+    )
+
+
+def curious(samples: Samples, score: jax.Array, tolerance: float) -> Samples:
+    """The samples that the curiosity stage teaches, the rest emptied (paper, appendix C).
+
+    Successes are half surprising (score [B] below 0.5) and half expected ones, failures as many as successes.
+    """
+    success = samples.success(tolerance)
+    novel, known, failed = success & (score < 0.5), success & (score >= 0.5), ~success
+    known &= jnp.cumsum(known) <= jnp.maximum(novel.sum(), 1)
+    failed &= jnp.cumsum(failed) <= jnp.maximum((novel | known).sum(), 1)
+    return samples.replace(view=jnp.where(novel | known | failed, samples.view, -1))
+
+
+TASKS_PER_VIEW = 8
+
+
+class ProposalTrials:
+    """Executes what the networks propose in an environment whose views are `clouds`."""
+
+    def __init__(self, env: Env, clouds: Clouds, ensemble: Ensemble, proposals: int):
+        self._env, self._clouds, self._ensemble, self._proposals = env, clouds, ensemble, proposals
+        self._execute = jax.jit(self._executed)
+        self._sample_by_view = jax.jit(self._sampled_by_view)
+
+    def _executed(self, start: Start, trajectory: jax.Array) -> EnvState:
+        rotation, residuals = unpack_trajectory(trajectory)
+        return self._env.execute(start.replace(rotation=rotation), residuals)
+
+    def _sampled_by_view(self, key: jax.Array) -> Start:
+        """A batch of starts in which every TASKS_PER_VIEW in a row share a view."""
+        kv, kt, ka = jax.random.split(key, 3)
+        view = jnp.repeat(self._env.sample(kv, max(1, self._env.config.batch // TASKS_PER_VIEW)).view, TASKS_PER_VIEW)
+        return self._env.approach(ka, view, self._env.sample_task(kt, view), self._env.config.guided_share)
+
+    def best(self, params: Params, start: Start, key: jax.Array) -> tuple[EnvState, jax.Array, jax.Array]:
+        """The networks' choice for the views and tasks of `start`: final states, trajectories [B, 30], scores [B].
+
+        Consumes the key.
+        """
+        chosen = select_actions(self._ensemble, params, self._clouds, start.view, start.task, key, self._proposals)
+        final = self._execute(replace(start, contact=chosen.contact), chosen.trajectory)
+        return final, chosen.trajectory, chosen.score
+
+    def explore(self, params: Params, key: jax.Array) -> tuple[EnvState, Samples, jax.Array]:
+        """A batch of trials to learn from, several tasks in each random view: see `explore_actions`.
+
+        Returns final states, samples, and which of them [B] bool are the networks' choice. Consumes the key.
+        """
+        ks, ke = jax.random.split(key)
+        start = self._sample_by_view(ks)
+        rows = (-1, TASKS_PER_VIEW)
+        contact, trajectory = explore_actions(
+            self._ensemble, params, self._clouds, start.view.reshape(rows)[:, 0], start.contact.reshape(rows),
+            start.task.reshape(rows), ke, self._proposals,
+        )  # fmt: skip
+        trajectory = trajectory.reshape(len(start.view), -1)
+        final = self._execute(replace(start, contact=contact.reshape(-1)), trajectory)
+        return final, samples_of(final, trajectory), jnp.arange(len(trajectory)) % 4 == 0

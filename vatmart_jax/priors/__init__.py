@@ -1,0 +1,1 @@
+"""Trained priors: load, save, predict, export."""
