@@ -12,6 +12,7 @@ import numpy as np
 
 from vatmart_jax import rotations as rot
 from vatmart_jax.atomic_io import whole
+from vatmart_jax.camera import Camera
 from vatmart_jax.trajectory import since_start, unpack_trajectory
 
 matplotlib.use("Agg")
@@ -95,10 +96,10 @@ def priors(
     points: [N, 3]; part_mask: [N] bool; actionability: [N]; contact: [3]; trajectories: [P, 30], best first, drawn
     with decreasing weight; scores: [P]; camera: azimuth and elevation (rad) as ViewBank has them.
     """
-    right, upward, toward = _camera(*camera)
-    project = lambda p: np.stack([p @ right, p @ upward], -1)  # noqa: E731
+    seen_from = camera_of_view(camera)
+    project = seen_from.project
     figure, axis = plt.subplots(figsize=(6.4, 5.4))
-    order = np.argsort(points @ toward)
+    order = np.argsort(-seen_from.depth(points))  # far ones first
     points, part_mask, actionability = points[order], part_mask[order], actionability[order]
     flat = project(points)
     axis.scatter(*flat[~part_mask].T, s=7, c="#c9ccd1", linewidths=0)
@@ -134,13 +135,9 @@ def waypoints(trajectory: np.ndarray, contact: np.ndarray, standoff: float) -> t
     return tips, np.asarray(frames)
 
 
-def _camera(azimuth: float, elevation: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Right, up and towards-the-camera directions; azimuth 0 looks from -x."""
-    a, e = float(azimuth), float(elevation)
-    toward = np.array([-np.cos(a) * np.cos(e), np.sin(a) * np.cos(e), np.sin(e)])
-    right = np.cross([0.0, 0.0, 1.0], toward)
-    right /= np.linalg.norm(right)
-    return right, np.cross(toward, right), toward
+def camera_of_view(camera: tuple[float, float]) -> Camera:
+    """The camera of a view, from its azimuth and elevation (rad) in the ViewBank."""
+    return Camera.looking_at(np.zeros(3), float(camera[0]), float(camera[1]))
 
 
 def _save(figure, out: Path) -> None:
