@@ -17,6 +17,7 @@ from tyro.conf import Positional, arg
 from vatmart_jax import __version__
 from vatmart_jax.atomic_io import whole_folder, write_json
 from vatmart_jax.errors import OpenGLError, UserError, one_of
+from vatmart_jax.registry import load_plugins
 
 _Json = Annotated[bool, arg(help="print one JSON object as the last line of standard output")]
 
@@ -31,6 +32,7 @@ def main(argv: list[str] | None = None) -> None:
         print(_usage(), file=sys.stdout if argv[:1] in (["-h"], ["--help"]) else sys.stderr)
         sys.exit(0 if argv[:1] in (["-h"], ["--help"]) else 2)
     try:
+        load_plugins()
         COMMANDS[argv[0]](argv[1:])
     except UserError as e:
         sys.exit(_fail(str(e)))
