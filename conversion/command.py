@@ -13,7 +13,7 @@ from conversion.convert import convert
 from conversion.model import ObjectError
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Convert:
     """Convert PartNet-Mobility objects to MJCF, reports and banks. What is up to date is left as it is."""
 

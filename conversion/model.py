@@ -23,7 +23,7 @@ class ObjectError(UserError):
     """An object folder cannot be converted; one line that names the file, the thing and the remedy."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Material:
     rgba: tuple[float, float, float, float]
     png: bytes | None  # its picture; the colour is white then

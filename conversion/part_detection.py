@@ -107,17 +107,11 @@ def _lid_motion(obj: ArticulatedObject, joint: Joint) -> tuple[float, int] | str
     for inward in (across, -across):
         elevation = np.arctan2(free @ up, free @ inward)
         sign = 1 if np.cross(axis, inward) @ up > 0 else -1
-        ends = [v for v in {joint.lower, joint.upper, 0.0} if joint.lower <= v <= joint.upper]
-        tilt = {v: abs((elevation + sign * v + np.pi) % (2 * np.pi) - np.pi) for v in ends}
-        closed = min(sorted(ends, key=abs), key=lambda v: tilt[v])
-        if tilt[closed] > LEVEL:  # within the range, a whole number of turns away
-            turns = np.arange(-2, 3) * 2 * np.pi
-            level = [v for v in (sign * (turns - elevation)).tolist() if joint.lower <= v <= joint.upper]
-            if not level:
-                continue
-            closed = min(level, key=abs)
+        closed = _level_value(joint, float(elevation), sign)
+        if closed is None:
+            continue
         over = ((turned(closed)[:, :2] >= low) & (turned(closed)[:, :2] <= high)).all(axis=1).mean()
-        found.append((float(over), float(closed), sign))
+        found.append((float(over), closed, sign))
     if not found:
         return "is a lid that lies level nowhere in its range"
     over, closed, sign = max(found, key=lambda f: f[0])
@@ -125,6 +119,17 @@ def _lid_motion(obj: ArticulatedObject, joint: Joint) -> tuple[float, int] | str
     if over < 0.5:
         return "is a lid that does not lie on the body"
     return (closed, sign) if room >= MIN_SWING else f"is a lid that opens only {room:.3g}"
+
+
+def _level_value(joint: Joint, elevation: float, sign: int) -> float | None:
+    """The joint value at which elevation + sign * value is 0 (rad, modulo turns), or an end or 0 where it nearly is."""
+    ends = sorted((v for v in {joint.lower, joint.upper, 0.0} if joint.lower <= v <= joint.upper), key=abs)
+    tilt = [abs((elevation + sign * v + np.pi) % (2 * np.pi) - np.pi) for v in ends]
+    if min(tilt) <= LEVEL:
+        return ends[int(np.argmin(tilt))]
+    turns = np.arange(-2, 3) * 2 * np.pi
+    level = [v for v in (sign * (turns - elevation)).tolist() if joint.lower <= v <= joint.upper]
+    return min(level, key=abs, default=None)
 
 
 def _posed(obj: ArticulatedObject, links: Iterable[str], values: Mapping[str, float] | None = None) -> np.ndarray:

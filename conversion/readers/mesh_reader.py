@@ -119,9 +119,9 @@ class MeshReader:
                 continue
             for name, (rgba, image) in read_mtl(text).items():
                 if image is not None and (png := self._picture(_beside(_beside(file, library), image))) is not None:
-                    found[name] = Material((1.0, 1.0, 1.0, rgba[3]), png)
+                    found[name] = Material(rgba=(1.0, 1.0, 1.0, rgba[3]), png=png)
                 else:
-                    found[name] = Material(rgba, None)
+                    found[name] = Material(rgba=rgba, png=None)
         for name in names[1:]:
             if libraries and found and name not in found:
                 self.folder.note(f"material {name!r} is in no library, plain colour")

@@ -204,7 +204,7 @@ class ViewBank:
         return cls(**_load(path, "views", [f.name for f in fields(cls)]))
 
 
-@struct.dataclass
+@struct.dataclass(kw_only=True)
 class SceneTable:
     """What the environment needs of S Scenes, on device."""
 
