@@ -17,7 +17,6 @@ import tyro
 from PIL import Image
 
 from vatmart_jax.atomic_io import atomic_write
-from vatmart_jax.camera import Camera
 from vatmart_jax.data.banks import SceneBank, ViewBank
 from vatmart_jax.envs.env import TASKS, Env
 from vatmart_jax.priors.pretrained import run_folder
@@ -63,11 +62,10 @@ def main(args: Figure) -> None:
         moved = result["moved"] if priors.config.task.endswith("drawer") else np.degrees(result["moved"])
         with tempfile.TemporaryDirectory() as folder:
             heat, film = Path(folder) / "heat.png", Path(folder) / "trial.gif"
-            camera = Camera.looking_at(np.zeros(3), float(env.views.azimuth[view]), float(env.views.elevation[view]))
             plots.priors_figure(
                 heat, points=points, part_mask=mask, actionability=np.asarray(found.actionability),
                 contact=found.contact, trajectories=np.asarray(found.trajectories[:3]),
-                scores=np.asarray(found.scores[:3]), camera=camera, title=f"{priors.config.task} by {asked}",
+                scores=np.asarray(found.scores[:3]), camera=env.views.camera(view), title=f"{priors.config.task} by {asked}",
                 standoff=env.config.standoff,
             )  # fmt: skip
             animate(recording, film)

@@ -45,7 +45,7 @@ class Pushes:
         frame = rot.gripper_frame(jnp.asarray(up), jnp.asarray(rng.normal(size=(BATCH, 3)), jnp.float32))
         position = self.views.contacts[view, contact] - (TIP + 0.03) * up
         qpos = np.zeros((BATCH, N_QPOS), np.float32)
-        qpos[:, PART] = self.views.q[view]
+        qpos[:, PART] = self.views.joint_pos[view]
         return scene.astype(np.int32), np.concatenate([position, rot.quat_from_matrix(frame)], -1), qpos
 
     def controls(self, seed: int = 0) -> np.ndarray:
@@ -233,7 +233,7 @@ def test_parts_have_the_configured_inertia_and_stay_within_their_range(cabinets)
         for _ in range(4):
             state = pushes.rollout(state, ctrl, EVERYONE)
         assert (state.qpos[:, PART] > -margin).all()
-        assert (state.qpos[:, PART] < pushes.bank.width[scene] + margin).all()
+        assert (state.qpos[:, PART] < pushes.bank.joint_range[scene] + margin).all()
 
 
 def test_hand_targets_put_the_fingertips_where_asked(doors):

@@ -7,7 +7,7 @@ import numpy as np
 import trimesh
 
 from vatmart_jax import rotations as rot
-from vatmart_jax.data.banks import HINGE, SLIDE, SceneBank, Scenes, ViewBank
+from vatmart_jax.data.banks import HINGE, SLIDE, SceneBank, SceneTable, ViewBank
 
 _HANDLE_POINTS, _HAND_REACH = 200, 0.05  # per shape of a handle; unit lengths about the contact
 
@@ -40,7 +40,7 @@ def canonical_grasps(bank: SceneBank, views: ViewBank) -> tuple[np.ndarray, np.n
         scene = int(views.scene[view])
         rows = np.flatnonzero(views.contact_handle[view])
         # Contacts and directions in the part's frame, where its shapes are.
-        rotation, position = _part_pose(bank, scene, float(views.q[view]))
+        rotation, position = _part_pose(bank, scene, float(views.joint_pos[view]))
         contact = (views.contacts[view, rows] - position) @ rotation
         if len(surfaces[scene]):
             local = _thin_axes(surfaces[scene], contact, up[view, rows] @ rotation)
@@ -53,7 +53,7 @@ def canonical_grasps(bank: SceneBank, views: ViewBank) -> tuple[np.ndarray, np.n
 def _motion(bank: SceneBank, views: ViewBank) -> tuple[np.ndarray, np.ndarray]:
     """Unit directions [V, C, 3] in which contacts move as the part opens, and their distance to the axis [V, C]
     (slides: 1)."""
-    scenes = Scenes.of(bank)
+    scenes = SceneTable.from_bank(bank)
     axis = np.broadcast_to(np.asarray(scenes.axis)[views.scene][:, None], views.contacts.shape)
     if bank.joint_type[0] == SLIDE:
         return axis, np.ones(axis.shape[:2])

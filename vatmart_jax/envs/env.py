@@ -20,7 +20,7 @@ import numpy as np
 from flax import struct
 
 from vatmart_jax import rotations as rot
-from vatmart_jax.data.banks import HINGE, SLIDE, SceneBank, Scenes, ViewBank
+from vatmart_jax.data.banks import HINGE, SLIDE, SceneBank, SceneTable, ViewBank
 from vatmart_jax.envs.contact_candidates import candidate_contacts, canonical_grasps
 from vatmart_jax.errors import UserError
 from vatmart_jax.physics import PhysicsConfig, PhysicsState, make_physics
@@ -145,13 +145,14 @@ class Env:
         config: EnvConfig | None = None,
         physics: PhysicsConfig | None = None,
     ):
-        """Keeps the Scenes of the task's joint type, and the views that leave room for the task and show where to do
+        """Keeps the Scenes of the task's kind of part, and the views that leave room for the task and show where to do
         it: a door seen from the inside alone cannot be pushed shut, one that is flush and has no handle cannot be
         pulled. (The released code goes further: its trials are ones that a policy has solved from that view.)
 
         Raises UserError where nothing is left.
         """
-        scenes = np.flatnonzero(bank.joint_type == task.joint_type)
+        part_kind = "door" if task.joint_type == HINGE else "drawer"
+        scenes = np.flatnonzero(bank.part_kind == part_kind)
         kind = "door (hinge)" if task.joint_type == HINGE else "drawer (slide)"
         if len(scenes) == 0:
             raise UserError(
@@ -159,8 +160,8 @@ class Env:
             )
         views = views.of_scenes(scenes)
         bank = bank.select(scenes)
-        remaining = bank.width[views.scene] - views.q if task.opening else views.q
-        views = views.select((views.opening == task.opening) & (remaining >= task.low))
+        remaining = bank.joint_range[views.scene] - views.joint_pos if task.opening else views.joint_pos
+        views = views.select(((views.direction > 0) == task.opening) & (remaining >= task.low))
         candidates = candidate_contacts(bank, views, task.opening)
         nothing = UserError(
             f"the data has no view of a {kind} that can be moved by task {task.name}; convert with more --views"
@@ -169,7 +170,7 @@ class Env:
             raise nothing
         self.task, self.config, self.bank = task, config or EnvConfig(), bank
         self.physics = make_physics(bank, impl, physics)
-        self._scenes = Scenes.of(bank)
+        self._scenes = SceneTable.from_bank(bank)
         canonical = canonical_grasps(bank, views) if task.opening else ()
         self._show(views, candidates, canonical)
         if task.opening:
@@ -185,7 +186,7 @@ class Env:
         """Trials begin at these views from now on."""
         bank, self.views = self.bank, views
         self._view_scene = jnp.asarray(views.scene)
-        self._view_q = jnp.asarray(views.q)
+        self._view_q = jnp.asarray(views.joint_pos)
         self._view_cdf = jnp.asarray(np.cumsum(_balanced(bank, views)), jnp.float32)
         self._contacts = jnp.asarray(views.contacts)
         self._normals = jnp.asarray(views.contact_normals)
@@ -242,7 +243,7 @@ class Env:
     def sample_goal(self, key: jax.Array, view: jax.Array) -> jax.Array:
         """[B] amounts for views [B]: density of t given q when t is uniform and q then uniform where t fits."""
         width, high = (
-            self._scenes.width[self._view_scene[view]],
+            self._scenes.joint_range[self._view_scene[view]],
             jnp.minimum(self.task.high, self._remaining_range(view)),
         )
         # p(t | q) is proportional to 1 / (width - t) on [low, high]; inverted here.
@@ -360,7 +361,7 @@ class Env:
     def _remaining_range(self, view: jax.Array) -> jax.Array:
         """[B] how far the parts of views [B] can move in the task's sense."""
         q = self._view_q[view]
-        return self._scenes.width[self._view_scene[view]] - q if self.task.opening else q
+        return self._scenes.joint_range[self._view_scene[view]] - q if self.task.opening else q
 
     def _placed(self, start: TrialStart, depth: float, amount: jax.Array | None = None) -> PhysicsState:
         """The hand with its tips `depth` past the contacts, closed to push and open to pull; part and hand as one moved

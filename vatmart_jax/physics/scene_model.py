@@ -145,7 +145,7 @@ def _spec(bank: SceneBank, scene: int, slots: tuple[int, int], config: PhysicsCo
         name="part",
         type=mujoco.mjtJoint.mjJNT_HINGE if hinge else mujoco.mjtJoint.mjJNT_SLIDE,
         axis=bank.axis[scene],
-        range=[0, bank.width[scene]],
+        range=[0, bank.joint_range[scene]],
         limited=True,
         damping=[config.part_damping[bank.joint_type[scene]], 0, 0],
         solref_limit=list(config.contact_solref),

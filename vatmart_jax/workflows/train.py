@@ -14,7 +14,6 @@ from flax import serialization
 
 from vatmart_jax import __version__
 from vatmart_jax.atomic_io import write_bytes, write_json
-from vatmart_jax.camera import Camera
 from vatmart_jax.config import to_json
 from vatmart_jax.data.dataset import SPLITS, Data, DataError
 from vatmart_jax.envs.env import TASKS, Env, Task
@@ -132,7 +131,6 @@ def draw_priors(priors: Priors, env: Env, key: jax.Array, out: Path) -> None:
         best = np.argsort(-np.asarray(predicted.scores))[:3]
         scene = env.views.scene[view]
         amount = f"{np.degrees(task):.0f} degrees" if env.task.joint_type == 0 else f"{task:.2f}"
-        angles = float(env.views.azimuth[view]), float(env.views.elevation[view])
         plots.priors_figure(
             out / f"priors_{number}.png",
             points=points,
@@ -141,7 +139,7 @@ def draw_priors(priors: Priors, env: Env, key: jax.Array, out: Path) -> None:
             contact=np.asarray(predicted.contact),
             trajectories=np.asarray(predicted.trajectories)[best],
             scores=np.asarray(predicted.scores)[best],
-            camera=Camera.looking_at(np.zeros(3), *angles),
+            camera=env.views.camera(view),
             title=f"{env.task.name} by {amount}: {env.bank.category[scene]} {env.bank.object_id[scene]}",
             standoff=env.config.standoff,
         )
