@@ -6,7 +6,7 @@ from dataclasses import dataclass, field, replace
 
 import jax
 
-from vatmart_jax.envs.env import EnvConfig
+from vatmart_jax.envs import EnvConfig
 from vatmart_jax.perception.networks import NetworksConfig
 from vatmart_jax.perception.pointnet2 import SMALL
 from vatmart_jax.perception.trainer import PerceptionConfig

@@ -7,7 +7,7 @@ from dataclasses import replace
 import jax
 import jax.numpy as jnp
 
-from vatmart_jax.envs.env import Env, EnvState, TrialStart
+from vatmart_jax.envs import Env, EnvState, TrialStart
 from vatmart_jax.perception.grouped_views import GroupedViews
 from vatmart_jax.perception.networks import Params
 from vatmart_jax.perception.predictor import TTAPredictor, explore_actions, select_actions

@@ -13,7 +13,7 @@ import numpy as np
 from flax import struct
 
 from vatmart_jax.data.banks import HINGE, SLIDE
-from vatmart_jax.envs.env import Env, Task, TrialStart
+from vatmart_jax.envs import Env, Task, TrialStart
 from vatmart_jax.perception import trainer as perception
 from vatmart_jax.perception.grouped_views import GroupedViews, group_views, network_points
 from vatmart_jax.perception.networks import Networks
@@ -242,7 +242,8 @@ def perception_config(settings: Settings, task: Task) -> PerceptionConfig:
     """The settings' perception config with the task's limits in it; drawers have no hinge."""
     networks = settings.perception.networks
     return replace(
-        settings.perception, low=task.low, high=task.high, tolerance=settings.env.tolerance, shift=task.shift,
+        settings.perception, low=task.goal_range[0], high=task.goal_range[1],
+        tolerance=settings.env.tolerance, shift=task.relabel_range,
         task_is_length=task.joint_type == SLIDE,
         networks=replace(networks, predict_axis=networks.predict_axis and task.joint_type == HINGE),
     )  # fmt: skip
