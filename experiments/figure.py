@@ -62,10 +62,11 @@ def main(args: Figure) -> None:
         moved = result["moved"] if priors.config.task.endswith("drawer") else np.degrees(result["moved"])
         with tempfile.TemporaryDirectory() as folder:
             heat, film = Path(folder) / "heat.png", Path(folder) / "trial.gif"
-            plots.priors(
-                points, mask, np.asarray(found.actionability), found.contact, np.asarray(found.trajectories[:3]),
-                np.asarray(found.scores[:3]), (float(env.views.azimuth[view]), float(env.views.elevation[view])),
-                f"{priors.config.task} by {asked}", heat, env.config.standoff,
+            plots.priors_figure(
+                heat, points=points, part_mask=mask, actionability=np.asarray(found.actionability),
+                contact=found.contact, trajectories=np.asarray(found.trajectories[:3]),
+                scores=np.asarray(found.scores[:3]), camera=env.views.camera(view), title=f"{priors.config.task} by {asked}",
+                standoff=env.config.standoff,
             )  # fmt: skip
             animate(recording, film)
             row[0].imshow(plt.imread(heat))

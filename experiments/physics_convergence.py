@@ -116,7 +116,7 @@ def pressing(env: Env, start: TrialStart, trials: int) -> dict[str, float]:
         data.mocap_pos[1], data.mocap_quat[1] = np.split(final.physics.gripper_pose[i], [3])
         mujoco.mj_forward(model, data)
         depth.append(-float(data.contact.dist.min()) if data.ncon else 0.0)
-        q, width = data.qpos[PART], env.bank.width[scene]
+        q, width = data.qpos[PART], env.bank.joint_range[scene]
         past.append(max(0.0, -q, q - width))
     share = float(np.mean(np.array(depth) > 0.05))
     return {

@@ -43,7 +43,7 @@ class Pushes:
         frame = rot.gripper_frame(jnp.asarray(up), jnp.asarray(rng.normal(size=(BATCH, 3)), jnp.float32))
         position = self.views.contacts[view, contact] - (GRIPPER.tip_offset + 0.03) * up
         qpos = np.zeros((BATCH, GRIPPER.num_qpos), np.float32)
-        qpos[:, PART] = self.views.q[view]
+        qpos[:, PART] = self.views.joint_pos[view]
         return scene.astype(np.int32), np.concatenate([position, rot.quat_from_matrix(frame)], -1), qpos
 
     def controls(self, seed: int = 0) -> np.ndarray:

@@ -115,11 +115,11 @@ def test_resets_are_determined_by_their_key(runs):
 @pytest.mark.parametrize("task", TASKS)
 def test_tasks_fit_the_room_and_approaches_the_cone(runs, task):
     env, start = runs(task).env, runs(task).sample(KEY)
-    q, width = env.views.q[start.view], env.bank.width[env.views.scene[start.view]]
+    q, width = env.views.joint_pos[start.view], env.bank.joint_range[env.views.scene[start.view]]
     room = width - q if env.task.grasps else q
     assert (start.goal >= env.task.goal_range[0] - 1e-6).all()
     assert (start.goal <= np.minimum(env.task.goal_range[1], room) + 1e-6).all()
-    assert np.isin(np.unique(env.views.opening[start.view]), [env.task.direction > 0])
+    assert np.isin(np.unique(env.views.direction[start.view]), [env.task.direction])
     inward = -env.views.contact_normals[start.view, start.contact]
     assert ((np.asarray(start.rotation)[:, :, 2] * inward).sum(-1) > np.cos(env.config.approach_cone) - 1e-5).all()
     np.testing.assert_allclose(np.linalg.det(start.rotation), 1, atol=1e-4)
@@ -132,7 +132,7 @@ def test_tasks_fit_the_room_and_approaches_the_cone(runs, task):
 def test_the_task_given_the_view_is_that_of_a_uniform_task_and_then_a_uniform_start(runs, task):
     env, rng = runs(task).env, np.random.default_rng(0)
     view = 1
-    q, width = env.views.q[view], env.bank.width[env.views.scene[view]]
+    q, width = env.views.joint_pos[view], env.bank.joint_range[env.views.scene[view]]
     ours = np.asarray(env.sample_goal(KEY, jnp.full(2000, view)))
     t = rng.uniform(env.task.goal_range[0], min(env.task.goal_range[1], width), 2_000_000)
     start = rng.uniform(0, width - t) if env.task.grasps else rng.uniform(t, width)
@@ -397,7 +397,7 @@ def test_data_without_the_tasks_parts_or_room_is_refused_by_the_tasks_name(cabin
     with pytest.raises(ValueError, match=r"no drawer \(slide\), which task push-drawer needs"):
         make_env(bank.select(doors), views.of_scenes(doors), "push-drawer")
     with pytest.raises(ValueError, match=r"no view of a door \(hinge\) that can be moved by task pull-door"):
-        make_env(bank, views.select(~views.opening), "pull-door")
-    shut = replace(views, q=np.full_like(views.q, 0.01))
+        make_env(bank, views.select(views.direction < 0), "pull-door")
+    shut = replace(views, joint_pos=np.full_like(views.joint_pos, 0.01))
     with pytest.raises(ValueError, match="push-door"):
         make_env(bank, shut, "push-door")

@@ -50,7 +50,7 @@ HELP = {
     "vatmart": ("--help",),
     **{command: (command, "--help") for command in COMMANDS},
     **{f"bench-{what}": ("bench", what, "--help") for what in ("physics", "parity", "perception")},
-    **{f"train-{preset}": ("train", "--preset", preset, "--help") for preset in PRESETS},
+    **{f"train-{preset}": ("train", "--preset", preset, "--help") for preset in PRESETS if preset != "quick"},
 }
 """Name of a file of values/help -> the command's words."""
 

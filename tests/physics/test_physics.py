@@ -124,7 +124,7 @@ def test_parts_have_the_configured_inertia_and_stay_within_their_range(cabinets)
         for _ in range(4):
             state = pushes.rollout(state, ctrl, EVERYONE)
         assert (state.qpos[:, PART] > -margin).all()
-        assert (state.qpos[:, PART] < pushes.bank.width[scene] + margin).all()
+        assert (state.qpos[:, PART] < pushes.bank.joint_range[scene] + margin).all()
 
 
 def test_hand_targets_put_the_fingertips_where_asked(doors):

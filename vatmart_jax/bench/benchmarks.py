@@ -24,7 +24,6 @@ import numpy as np
 
 from vatmart_jax.data.banks import SceneBank, ViewBank
 from vatmart_jax.envs import TASKS, Env, EnvConfig, EnvState, TrialStart, make_env
-from vatmart_jax.envs.bank_columns import part_kind
 from vatmart_jax.envs.scripted_policy import scripted_action
 from vatmart_jax.errors import UserError, require_one_of
 from vatmart_jax.perception import trainer as perception
@@ -145,7 +144,7 @@ def bench_parity(
         variants = {impl: (impl, bank) for impl in impls} | {f"{impls[0]} on {other.collision}": (impls[0], other)}
     outcomes: dict[str, dict[str, EnvState]] = {}  # by task and variant
     for name, task in TASKS.items():
-        if not (part_kind(bank) == task.part_kind).any():
+        if not (bank.part_kind == task.part_kind).any():
             say(f"{name}: no Scene")
             continue
         outcomes[name] = {}

@@ -93,8 +93,8 @@ class Data:
             scenes.append(bank.select(chosen))
             views.append(its_views.of_scenes(chosen))
         try:
-            self._scenes = SceneBank.joined(scenes)
-            self._views = ViewBank.joined(views, [len(bank) for bank in scenes])
+            self._scenes = SceneBank.concatenate(scenes)
+            self._views = ViewBank.concatenate(views, [len(bank) for bank in scenes])
         except ValueError as e:
             folders = ", ".join(map(str, (self.folder, *more)))
             raise DataError(f"{folders}: cannot be trained on together: {e}; convert them with the same flags") from e

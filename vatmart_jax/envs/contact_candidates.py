@@ -8,8 +8,7 @@ import numpy as np
 import trimesh
 from scipy.spatial.transform import Rotation
 
-from vatmart_jax.data.banks import HINGE, SLIDE, SceneBank, ViewBank
-from vatmart_jax.envs.bank_columns import joint_pos, scene_table
+from vatmart_jax.data.banks import HINGE, SLIDE, SceneBank, SceneTable, ViewBank
 from vatmart_jax.envs.task import Task
 
 _HANDLE_POINTS, _HAND_REACH = 200, 0.05  # per shape of a handle; unit lengths about the contact
@@ -68,7 +67,7 @@ def canonical_grasps(
 def _opening_motion(bank: SceneBank, views: ViewBank) -> tuple[np.ndarray, np.ndarray]:
     """Unit directions [V, C, 3] in which contacts move as the part opens, and their distance to the axis [V, C]
     (slides: 1)."""
-    table = scene_table(bank)
+    table = SceneTable.from_bank(bank)
     axis = np.broadcast_to(np.asarray(table.axis)[views.scene][:, None], views.contacts.shape)
     if bank.joint_type[0] == SLIDE:
         return axis, np.ones(axis.shape[:2])
@@ -93,7 +92,7 @@ def _handle_surface(bank: SceneBank, scene: int) -> np.ndarray:
 
 def _part_poses(bank: SceneBank, views: ViewBank) -> tuple[np.ndarray, np.ndarray]:
     """Rotations [V, 3, 3] and positions [V, 3] of the part's frame in each view, object frame."""
-    scene, q = views.scene, joint_pos(views).astype(float)[:, None]
+    scene, q = views.scene, views.joint_pos.astype(float)[:, None]
     rotation = Rotation.from_quat(bank.part_quat[scene], scalar_first=True)
     axis, position = bank.axis[scene], bank.part_pos[scene]
     if bank.joint_type[0] == HINGE:

@@ -21,9 +21,8 @@ import jax
 import jax.numpy as jnp
 
 from vatmart_jax import rotations as rot
-from vatmart_jax.data.banks import SceneBank, ViewBank
+from vatmart_jax.data.banks import SceneBank, SceneTable, ViewBank
 from vatmart_jax.envs import start_sampler
-from vatmart_jax.envs.bank_columns import joint_range
 from vatmart_jax.envs.observation import build_observation, observation_size
 from vatmart_jax.envs.rewards import REWARD_TERMS, reward_terms, tracking_cost
 from vatmart_jax.envs.start_sampler import StartTable
@@ -53,7 +52,7 @@ class Env:
     task: Task
     config: EnvConfig
     physics: Physics
-    scene_table: Any  # the S Scenes' joints
+    scene_table: SceneTable
     view_table: ViewTable
     starts: StartTable
     bank: SceneBank = None  # pyright: ignore[reportAssignmentType]  the Scenes, host arrays; None inside jitted functions
@@ -192,7 +191,7 @@ class Env:
         return self._motion_axis(scene), self.scene_table.anchor[scene]
 
     def _joint_range(self, view: jax.Array) -> jax.Array:
-        return joint_range(self.scene_table)[self.view_table.scene[view]]
+        return self.scene_table.joint_range[self.view_table.scene[view]]
 
     def _remaining_range(self, view: jax.Array) -> jax.Array:
         """[B] how far the parts of views [B] can move in the task's direction."""

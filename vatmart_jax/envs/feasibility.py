@@ -10,7 +10,6 @@ import numpy as np
 
 from vatmart_jax import rotations as rot
 from vatmart_jax.data.banks import SceneBank, ViewBank
-from vatmart_jax.envs.bank_columns import joint_pos
 from vatmart_jax.envs.contact_candidates import Grasps, canonical_grasps
 from vatmart_jax.envs.task import Task
 from vatmart_jax.physics import Physics
@@ -63,7 +62,7 @@ def feasible_contacts(
 
 def _hand_fits(physics: Physics, views: ViewBank, tested: np.ndarray, grasps: Grasps, standoff: float) -> np.ndarray:
     """[V, C] bool, of the tested ones: the open hand is free before the canonical grasp and when it has advanced."""
-    gripper, start = physics.gripper, joint_pos(views)
+    gripper, start = physics.gripper, views.joint_pos
     opening = jnp.full((_FIT_BATCH,), gripper.max_opening)
 
     @jax.jit

@@ -7,8 +7,7 @@ from collections.abc import Collection, Mapping
 import jax.numpy as jnp
 import numpy as np
 
-from vatmart_jax.data.banks import SceneBank, ViewBank
-from vatmart_jax.envs.bank_columns import direction, joint_pos, joint_range, part_kind, scene_table
+from vatmart_jax.data.banks import SceneBank, SceneTable, ViewBank
 from vatmart_jax.envs.contact_candidates import candidate_contacts
 from vatmart_jax.envs.env import Env
 from vatmart_jax.envs.feasibility import FeasibleContacts, feasible_contacts
@@ -61,7 +60,7 @@ def make_envs(
     """
     task = get_task(task) if isinstance(task, str) else task
     config = config or EnvConfig()
-    kind = (part_kind(scenes) == task.part_kind) & (scenes.joint_type == task.joint_type)
+    kind = (scenes.part_kind == task.part_kind) & (scenes.joint_type == task.joint_type)
     members = {
         name: np.isin(np.arange(len(scenes)), np.arange(len(scenes))[chosen]) & kind for name, chosen in splits.items()
     }
@@ -97,9 +96,9 @@ def make_envs(
 
 def _with_range(bank: SceneBank, views: ViewBank, task: Task) -> ViewBank:
     """The views that were drawn for the task's direction and leave its smallest goal."""
-    q = joint_pos(views)
-    remaining = joint_range(bank)[views.scene] - q if task.direction > 0 else q
-    return views.select((direction(views) == task.direction) & (remaining >= task.goal_range[0]))
+    q = views.joint_pos
+    remaining = bank.joint_range[views.scene] - q if task.direction > 0 else q
+    return views.select((views.direction == task.direction) & (remaining >= task.goal_range[0]))
 
 
 def _env(
@@ -118,10 +117,10 @@ def _env(
         task=task,
         config=config,
         physics=physics,
-        scene_table=scene_table(bank),
+        scene_table=SceneTable.from_bank(bank),
         view_table=ViewTable(
             scene=table(views.scene),
-            joint_pos=table(joint_pos(views)),
+            joint_pos=table(views.joint_pos),
             contacts=table(views.contacts),
             normals=table(views.contact_normals),
         ),

@@ -7,7 +7,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Literal
 
-from vatmart_jax.data.banks import HINGE, SLIDE
+from vatmart_jax.data.part_kinds import HINGE, PART_KINDS
 from vatmart_jax.errors import UserError
 from vatmart_jax.registry import Registry
 
@@ -17,7 +17,7 @@ class Task:
     """Move one part of an object by a goal. Goals are positive: rad (hinges) or unit lengths (slides)."""
 
     name: str
-    part_kind: str  # door, drawer, lid
+    part_kind: str  # a name of PART_KINDS: door, drawer, lid
     joint_type: int  # HINGE or SLIDE
     direction: int  # +1 opens, -1 closes
     interaction: Literal["push", "grasp"]  # with closed fingers; or open, advance, close, and then move
@@ -103,20 +103,19 @@ class _TaskView(Mapping[str, Task]):
 
 TASKS: Mapping[str, Task] = _TaskView()
 
-_TURN, _SLIDE = (math.radians(10), math.radians(70)), (0.1, 0.7)
 _VERBS: tuple[tuple[str, int, Literal["push", "grasp"]], ...] = (("push", -1, "push"), ("pull", 1, "grasp"))
-for _kind, _joint, _goals in (("door", HINGE, _TURN), ("drawer", SLIDE, _SLIDE), ("lid", HINGE, _TURN)):
+for _kind in map(PART_KINDS.get, ("door", "drawer", "lid")):
     for _verb, _direction, _interaction in _VERBS:
         register_task(
             Task(
-                name=f"{_verb}-{_kind}",
-                part_kind=_kind,
-                joint_type=_joint,
+                name=f"{_verb}-{_kind.name}",
+                part_kind=_kind.name,
+                joint_type=_kind.joint_type,
                 direction=_direction,
                 interaction=_interaction,
-                goal_range=_goals,
-                relabel_range=math.radians(45) if _joint == HINGE else 0.45,
+                goal_range=_kind.goal_range,
+                relabel_range=_kind.relabel_range,
                 # A lid lies flat: handles on its front stick out across its motion.
-                handle_approach=("motion", "normal") if _kind == "lid" else ("motion",),
+                handle_approach=("motion", "normal") if _kind.name == "lid" else ("motion",),
             )
         )

@@ -66,11 +66,6 @@ def scene_model(
     return model
 
 
-def joint_range(bank: SceneBank) -> np.ndarray:
-    """[S] joint positions are in [0, joint_range], whatever the bank's version calls the column."""
-    return bank.joint_range if hasattr(bank, "joint_range") else bank.width
-
-
 def _instances(bank: SceneBank, scene: int) -> tuple[np.ndarray, np.ndarray]:
     static = np.arange(bank.static_start[scene], bank.static_start[scene + 1])
     return static, np.arange(bank.part_start[scene], bank.part_start[scene + 1])
@@ -110,7 +105,7 @@ def _spec(bank: SceneBank, scene: int, slots: tuple[int, int], config: PhysicsCo
         name="part",
         type=mujoco.mjtJoint.mjJNT_HINGE if hinge else mujoco.mjtJoint.mjJNT_SLIDE,
         axis=bank.axis[scene],
-        range=[0, joint_range(bank)[scene]],
+        range=[0, bank.joint_range[scene]],
         limited=True,
         damping=[config.part_damping[bank.joint_type[scene]], 0, 0],
         solref_limit=list(config.contact_solref),

@@ -18,7 +18,6 @@ import numpy as np
 from vatmart_jax.atomic_io import atomic_write
 from vatmart_jax.data.banks import SceneBank, ViewBank
 from vatmart_jax.envs import TASKS, Env, EnvConfig, EnvState, Task, TrialStart, make_env
-from vatmart_jax.envs.bank_columns import part_kind
 from vatmart_jax.envs.scripted_policy import run_scripted_policy
 from vatmart_jax.errors import OpenGLError, UserError, require_one_of, summarize_error
 from vatmart_jax.physics.scene_model import scene_model
@@ -62,7 +61,7 @@ def play(
     bank, views = SceneBank.load(folder / "scenes.npz"), ViewBank.load(folder / "views.npz")
     chosen = np.array([find_scene(bank, scene)])
     priors = Priors.load(run) if run else None
-    name = task or (priors.config.task if priors else f"push-{part_kind(bank)[chosen[0]]}")
+    name = task or (priors.config.task if priors else f"push-{bank.part_kind[chosen[0]]}")
     require_one_of("--task", name, TASKS)
     env = make_env(bank.select(chosen), views.of_scenes(chosen), TASKS[name], "c", EnvConfig(num_envs=TRIES))
     start = jax.jit(lambda key: env.sample(key, TRIES))(jax.random.key(seed))

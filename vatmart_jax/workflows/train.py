@@ -131,17 +131,17 @@ def draw_priors(priors: Priors, env: Env, key: jax.Array, out: Path) -> None:
         best = np.argsort(-np.asarray(predicted.scores))[:3]
         scene = env.views.scene[view]
         amount = f"{np.degrees(task):.0f} degrees" if env.task.joint_type == 0 else f"{task:.2f}"
-        plots.priors(
-            points,
-            mask,
-            np.asarray(predicted.actionability),
-            np.asarray(predicted.contact),
-            np.asarray(predicted.trajectories)[best],
-            np.asarray(predicted.scores)[best],
-            (float(env.views.azimuth[view]), float(env.views.elevation[view])),
-            f"{env.task.name} by {amount}: {env.bank.category[scene]} {env.bank.object_id[scene]}",
+        plots.priors_figure(
             out / f"priors_{number}.png",
-            env.config.standoff,
+            points=points,
+            part_mask=mask,
+            actionability=np.asarray(predicted.actionability),
+            contact=np.asarray(predicted.contact),
+            trajectories=np.asarray(predicted.trajectories)[best],
+            scores=np.asarray(predicted.scores)[best],
+            camera=env.views.camera(view),
+            title=f"{env.task.name} by {amount}: {env.bank.category[scene]} {env.bank.object_id[scene]}",
+            standoff=env.config.standoff,
         )
 
 

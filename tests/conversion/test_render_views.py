@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import fields
+from dataclasses import fields, replace
 
 import mujoco
 import numpy as np
@@ -10,12 +10,14 @@ import pytest
 import trimesh
 from generated import box, joint, made, read_with_hulls
 
-from conversion.mjcf import VISUAL_GROUP, MjcfConfig, to_mjcf
-from conversion.partnet import ConvertedObject, ObjectError
-from conversion.scenes import other_values, scene_bank
-from conversion.views import DISTANCE, TASKS, views
+from conversion.config import MjcfConfig, ViewConfig
+from conversion.mjcf import VISUAL_GROUP, to_mjcf
+from conversion.model import ConvertedObject
+from conversion.render_views import DISTANCE, render_views
+from conversion.scenes import other_values, scene_bank, scene_specs
 from mjcf_assets.procedural.generate import generate
 from vatmart_jax.data.banks import SceneBank, ViewBank
+from vatmart_jax.data.part_kinds import PART_KINDS
 
 REAL = ("45194", "101564", "7167")
 VISUALS = np.array([k == VISUAL_GROUP for k in range(6)], np.uint8)
@@ -30,14 +32,26 @@ def objects(tmp_path_factory) -> list[ConvertedObject]:
 
 @pytest.fixture(scope="module")
 def bank(objects) -> SceneBank:
-    return scene_bank(objects, 2, "hull", seed=0)
+    return bank_of(objects)
 
 
 @pytest.fixture(scope="module")
 def seen(objects, bank) -> ViewBank:
-    out, skipped = views(objects, bank, 2, 3000, 200, seed=0, jobs=1)
+    out, skipped = views_of(objects, 2, 3000, 200)
     assert not skipped
     return out
+
+
+def bank_of(objects: list[ConvertedObject], variants: int = 2) -> SceneBank:
+    return scene_bank([spec for o in objects for spec in scene_specs(o, variants, seed=0)], "hull")
+
+
+def views_of(
+    objects: list[ConvertedObject], views: int, points: int, contacts: int, variants: int = 2, jobs: int = 1
+) -> tuple[ViewBank, list[tuple[int, str]]]:
+    """Views of every Scene, of training objects as many as of others."""
+    config = ViewConfig(views=views, train_factor=1, points=points, contacts=contacts)
+    return render_views(objects, variants, 0, config, jobs)
 
 
 def camera(view: ViewBank, v: int, centre: np.ndarray) -> np.ndarray:
@@ -93,7 +107,7 @@ def check_against_mujoco(objects, bank: SceneBank, seen: ViewBank, n: int) -> No
     for v in range(len(seen)):
         s = int(seen.scene[v])
         world = worlds[bank.object_id[s]]
-        moving = list(world.show(bank, s, float(seen.q[v])))
+        moving = list(world.show(bank, s, float(seen.joint_pos[v])))
         eye = camera(seen, v, centre(world.converted, bank, s))
         some = rng.choice(len(seen.contacts[v]), n)
         contacts = seen.contacts[v][some].astype(float)
@@ -116,8 +130,8 @@ def test_masks_and_depths_agree_with_mujoco(objects, bank, seen):
 @pytest.mark.parametrize("name", REAL)
 def test_masks_and_depths_of_real_objects_agree_with_mujoco(real_objects, name):
     converted = read_with_hulls(real_objects / name)
-    bank = scene_bank([converted], 2, "hull", seed=0)
-    seen, skipped = views([converted], bank, 1, 3000, 200, seed=0, jobs=1)
+    bank = bank_of([converted])
+    seen, skipped = views_of([converted], 1, 3000, 200)
     assert len(seen) == 2 * (len(bank) - len(skipped)) > 0
     check_against_mujoco([converted], bank, seen, 200)
 
@@ -130,7 +144,7 @@ def test_points_lie_on_the_visual_surface(objects, bank, seen):
         converted = by_id[bank.object_id[s]]
         part = next(p for p in converted.parts if p.link == bank.part[s])
         values = other_values(converted, part, int(bank.variant[s]), seed=0)
-        values[part.joint] = float(bank.urdf_closed[s] + bank.urdf_sign[s] * seen.q[v])
+        values[part.joint] = float(bank.urdf_closed[s] + bank.urdf_sign[s] * seen.joint_pos[v])
         poses = converted.obj.link_poses(values)
         meshes = [
             trimesh.Trimesh(x.vertices @ poses[k][:3, :3].T + poses[k][:3, 3], x.faces, process=False)
@@ -145,26 +159,25 @@ def test_points_lie_on_the_visual_surface(objects, bank, seen):
         assert np.median(normals) > 0.999
 
 
-def test_normals_are_unit_and_face_the_camera(objects, bank, seen):
+def test_contact_normals_are_unit_and_face_the_camera(objects, bank, seen):
     by_id = {o.obj.id: o for o in objects}
     for v in range(len(seen)):
         s = int(seen.scene[v])
         eye = camera(seen, v, centre(by_id[bank.object_id[s]], bank, s))
-        for points, normals in ((seen.points, seen.normals), (seen.contacts, seen.contact_normals)):
-            n, p = normals[v].astype(float), points[v].astype(float)
-            np.testing.assert_allclose(np.linalg.norm(n, axis=1), 1, atol=2e-3)
-            assert ((n * (eye - p)).sum(1) > -5e-3).all()
+        n, p = seen.contact_normals[v].astype(float), seen.contacts[v].astype(float)
+        np.testing.assert_allclose(np.linalg.norm(n, axis=1), 1, atol=1e-5)
+        assert ((n * (eye - p)).sum(1) > -1e-5).all()
 
 
 def test_cameras_and_openings_are_the_papers(bank, seen):
     assert (np.abs(seen.azimuth) <= np.pi / 2).all() and np.ptp(seen.azimuth) > 2
     assert (seen.elevation >= np.pi / 6).all() and (seen.elevation <= np.pi / 3).all()
-    assert seen.opening.sum() * 2 == len(seen)
-    width = bank.width[seen.scene]
-    low = np.array([TASKS[t][0] for t in bank.joint_type[seen.scene]])
-    room = np.where(seen.opening, width - seen.q, seen.q)
+    assert (seen.direction == 1).sum() * 2 == (seen.direction == -1).sum() * 2 == len(seen)
+    width = bank.joint_range[seen.scene]
+    low = np.array([PART_KINDS.get(kind).goal_range[0] for kind in bank.part_kind[seen.scene]])
+    room = np.where(seen.direction > 0, width - seen.joint_pos, seen.joint_pos)
     assert (room >= np.minimum(low, width) - 1e-6).all()
-    assert (seen.q >= 0).all() and (seen.q <= width + 1e-6).all()
+    assert (seen.joint_pos >= 0).all() and (seen.joint_pos <= width + 1e-6).all()
 
 
 def test_contacts_on_handles_are_marked(objects, bank, seen):
@@ -177,7 +190,7 @@ def test_contacts_on_handles_are_marked(objects, bank, seen):
         visuals = [x for k in obj.subtree(bank.part[s]) for x in obj.links[k].visuals if x.is_handle]
         if len(obj.subtree(bank.part[s])) > 1 or not visuals:
             continue
-        value = float(bank.urdf_closed[s] + bank.urdf_sign[s] * seen.q[v])
+        value = float(bank.urdf_closed[s] + bank.urdf_sign[s] * seen.joint_pos[v])
         part = next(p for p in by_id[obj.id].parts if p.link == bank.part[s])
         values = other_values(by_id[obj.id], part, int(bank.variant[s]), seed=0) | {part.joint: value}
         pose = obj.link_poses(values)[part.link]
@@ -190,10 +203,10 @@ def test_contacts_on_handles_are_marked(objects, bank, seen):
     assert marked > 20
 
 
-def test_points_come_in_random_order_and_repeat_only_after_all(objects, bank):
-    chosen = bank.select(np.flatnonzero(bank.object_id == objects[0].obj.id)[:1])
-    few, _ = views(objects[:1], chosen, 1, 500, 64, seed=0, jobs=1)
-    many, _ = views(objects[:1], chosen, 1, 150_000, 64, seed=0, jobs=1)
+def test_points_come_in_random_order_and_repeat_only_after_all(objects):
+    one = [replace(objects[0], parts=objects[0].parts[:1])]
+    few, _ = views_of(one, 1, 500, 64, variants=1)
+    many, _ = views_of(one, 1, 150_000, 64, variants=1)
     np.testing.assert_array_equal(few.points, many.points[:, :500])
     for points, mask in zip(many.points, many.part_mask, strict=True):
         matches = np.flatnonzero((points[1:-20] == points[0]).all(axis=1)) + 1
@@ -205,15 +218,14 @@ def test_points_come_in_random_order_and_repeat_only_after_all(objects, bank):
 
 
 def test_views_do_not_depend_on_jobs_or_order(objects, bank, seen):
-    both = [objects[7].obj.id, objects[2].obj.id]
-    chosen = np.flatnonzero(np.isin(bank.object_id, both))
-    again, skipped = views(objects[::-1], bank.select(chosen[::-1]), 2, 3000, 200, seed=0, jobs=2)
+    both = [objects[7], objects[2]]
+    again, skipped = views_of(both, 2, 3000, 200, jobs=2)
     assert not skipped
-    want = seen.of_scenes(chosen)
-    back = again.of_scenes(np.arange(len(chosen))[::-1])
-    order = np.argsort(back.scene, kind="stable")
+    scenes = [np.flatnonzero(bank.object_id == o.obj.id) for o in both]
+    want = [seen.of_scenes(own) for own in scenes]
+    want = ViewBank.concatenate(want, [len(own) for own in scenes])
     for field in fields(ViewBank):
-        np.testing.assert_array_equal(getattr(back, field.name)[order], getattr(want, field.name), field.name)
+        np.testing.assert_array_equal(getattr(again, field.name), getattr(want, field.name), field.name)
 
 
 def test_banks_come_back_from_their_file(seen, tmp_path):
@@ -235,8 +247,8 @@ def test_a_part_out_of_sight_is_skipped_with_a_reason():
         },
         [joint("inner", "prismatic", (-1, 0, 0), 0, 0.15), joint("outer", "prismatic", (-1, 0, 0), 0, 0.5)],
     )
-    bank = scene_bank([converted], 1, "hull", seed=0)
-    seen, skipped = views([converted], bank, 2, 100, 50, seed=0, jobs=1)
+    bank = bank_of([converted], variants=1)
+    seen, skipped = views_of([converted], 2, 100, 50, variants=1)
     hidden = int(np.flatnonzero(bank.part == "inner")[0])
     assert skipped == [(hidden, "chest inner: fewer than 32 pixels of it in 20 views")]
     assert set(seen.scene) == {1 - hidden} and len(seen) == 4
@@ -244,12 +256,18 @@ def test_a_part_out_of_sight_is_skipped_with_a_reason():
 
 def test_views_of_no_scene_are_an_empty_bank():
     converted = made("block", {"base": [box("body-1", (0, 0, 0), (1, 1, 1))]}, [])
-    seen, skipped = views([converted], scene_bank([converted], 1, "hull", seed=0), 2, 100, 50, seed=0, jobs=1)
+    seen, skipped = views_of([converted], 2, 100, 50, variants=1)
     assert len(seen) == 0 and seen.points.shape == (0, 100, 3) and not skipped
 
 
-def test_scenes_of_another_seed_or_object_are_refused(objects, bank):
-    with pytest.raises(ObjectError, match="made from another version or seed; make them again"):
-        views(objects, bank, 1, 100, 50, seed=1, jobs=1)
-    with pytest.raises(ObjectError, match=f"{objects[0].obj.id}: a Scene of the bank has no object"):
-        views(objects[1:], bank, 1, 100, 50, seed=0, jobs=1)
+def test_training_objects_have_more_views_and_the_others_the_first_of_them(objects):
+    config = ViewConfig(views=1, train_factor=3, points=100, contacts=50)
+    one = replace(objects[0], parts=objects[0].parts[:1])
+    many, _ = render_views([replace(one, split="train")], 1, 0, config)
+    few, _ = render_views([replace(one, split="test_shapes")], 1, 0, config)
+    assert (len(many), len(few)) == (6, 2)
+    np.testing.assert_array_equal(many.points[[0, 3]], few.points)
+
+
+def test_no_objects_give_an_empty_bank():
+    assert len(render_views([], 1, 0, ViewConfig(points=10, contacts=5))[0]) == 0

@@ -12,17 +12,29 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial import ConvexHull, Delaunay
 
-from conversion.decompose import DecomposeConfig, Surface, decompose, fidelity, merged
-from conversion.partnet import Hull, Visual, clean, parts, read_object
+from conversion.config import DecomposeConfig
+from conversion.decompose import decompose, merge_hulls
+from conversion.fidelity import measure_fidelity
+from conversion.model import ConvexShape, Visual
+from conversion.part_detection import detect_parts
+from conversion.readers import read_object
+from conversion.readers.mesh_reader import clean
+from conversion.surface import Surface
 
 CONFIG = DecomposeConfig()
 
 
-def hulls_of(visuals: list[Visual], budget: int = 16, config: DecomposeConfig = CONFIG, seed: int = 0) -> list[Hull]:
+def hulls_of(
+    visuals: list[Visual], budget: int = 16, config: DecomposeConfig = CONFIG, seed: int = 0
+) -> list[ConvexShape]:
     return decompose(Surface(visuals, seed), budget, config)
 
 
-def covered(hulls: list[Hull], points: np.ndarray, slack: float = 1e-6) -> np.ndarray:
+def leaf(name: str, vertices: np.ndarray, faces: np.ndarray) -> Visual:
+    return Visual(name=name, vertices=vertices, faces=faces, is_handle="handle" in name, file=None)
+
+
+def covered(hulls: list[ConvexShape], points: np.ndarray, slack: float = 1e-6) -> np.ndarray:
     equations = [ConvexHull(h.vertices).equations for h in hulls]
     out = np.stack([(points @ e[:, :3].T + e[:, 3]).max(axis=1) for e in equations])
     return out.min(axis=0) <= slack
@@ -41,7 +53,7 @@ def tray(wall: float) -> list[Visual]:
     start = np.cumsum([0] + [len(b.vertices) for b in boxes])
     vertices = np.concatenate([b.vertices for b in boxes])
     faces = np.concatenate([b.faces + s for b, s in zip(boxes, start, strict=False)])
-    return [Visual("tray-1", *clean(vertices, faces), False, None)]
+    return [leaf("tray-1", *clean(vertices, faces))]
 
 
 def handle(name: str = "handle-1", room: float = 0.04) -> Visual:
@@ -52,13 +64,8 @@ def handle(name: str = "handle-1", room: float = 0.04) -> Visual:
         box(name, (-room, 0.68, 0.45), (0, 0.7, 0.47)),
     ]
     start = np.cumsum([0] + [len(b.vertices) for b in boxes])
-    return Visual(
-        name,
-        np.concatenate([b.vertices for b in boxes]),
-        np.concatenate([b.faces + s for b, s in zip(boxes, start, strict=False)]),
-        "handle" in name,
-        None,
-    )
+    vertices = np.concatenate([b.vertices for b in boxes])
+    return leaf(name, vertices, np.concatenate([b.faces + s for b, s in zip(boxes, start, strict=False)]))
 
 
 def test_a_board_is_one_exact_hull():
@@ -79,7 +86,7 @@ def test_an_open_box_keeps_its_inside_free(wall):
 
 
 def test_flat_sheets_become_thick_enough_to_collide():
-    sheet = Visual("s", np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0.0]]), np.array([[0, 1, 2]]), False, None)
+    sheet = leaf("s", np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0.0]]), np.array([[0, 1, 2]]))
     (hull,) = hulls_of([sheet])
     assert np.ptp(hull.vertices[:, 2]) == pytest.approx(CONFIG.thickness)
 
@@ -105,7 +112,7 @@ def test_a_recess_behind_a_handle_is_finer_than_elsewhere():
     start = np.cumsum([0] + [len(b.vertices) for b in ring])
     vertices = np.concatenate([b.vertices for b in ring])
     faces = np.concatenate([b.faces + s for b, s in zip(ring, start, strict=False)])
-    panel = Visual("panel-3", vertices, faces, False, None)
+    panel = leaf("panel-3", vertices, faces)
     pocket = np.array([[0.006, 0.5, 0.46]])
     assert covered(hulls_of([panel]), pocket).all()
     assert not covered([h for h in hulls_of([panel, handle()]) if not h.is_handle], pocket).any()
@@ -122,7 +129,7 @@ def test_budget_and_vertex_limit_hold_whatever_comes():
     rng = np.random.default_rng(3)
     scatter = [box(f"b-{i}", *(lambda a: (a, a + rng.uniform(0.02, 0.2, 3)))(rng.uniform(0, 2, 3))) for i in range(60)]
     ball = trimesh.creation.icosphere(3, 0.2)
-    scatter.append(Visual("ball", np.asarray(ball.vertices) + 3, np.asarray(ball.faces), False, None))
+    scatter.append(leaf("ball", np.asarray(ball.vertices) + 3, np.asarray(ball.faces)))
     scatter += [replace(handle(f"handle-{i}"), vertices=handle().vertices + np.array([0, 0, i])) for i in range(8)]
     hulls = hulls_of(scatter, budget=16)
     assert len(hulls) <= 16
@@ -139,17 +146,17 @@ def test_same_input_gives_the_same_hulls():
 def test_coacd_takes_concave_leaves_apart_too():
     profile = trimesh.path.polygons.Polygon([(0, 0), (1, 0), (1, 0.2), (0.2, 0.2), (0.2, 1), (0, 1)])
     corner = trimesh.creation.extrude_polygon(profile, 0.3)
-    visuals = [Visual("corner-1", np.asarray(corner.vertices), np.asarray(corner.faces), False, None)]
+    visuals = [leaf("corner-1", np.asarray(corner.vertices), np.asarray(corner.faces))]
     hulls = hulls_of(visuals, config=replace(CONFIG, decomposer="coacd"))
     assert 2 <= len(hulls) <= 16
-    assert fidelity(Surface(visuals), hulls).gap_max < 0.02
+    assert measure_fidelity(Surface(visuals), hulls).gap_max < 0.02
 
 
 def test_hulls_of_several_groups_merge_to_a_budget_and_keep_what_they_can():
     drawers = [box(f"front-{i}", (0, 0, 0.2 * i), (0.02, 1, 0.2 * i + 0.19)) for i in range(5)]
     post = box("post", (0, 3, 0), (0.1, 3.1, 1))
-    hulls = [Hull(v.vertices, False) for v in (*drawers, post)]
-    kept, new = merged(Surface([*drawers, post]), hulls, 2, CONFIG)
+    hulls = [ConvexShape(vertices=v.vertices, is_handle=False) for v in (*drawers, post)]
+    kept, new = merge_hulls(Surface([*drawers, post]), hulls, 2, CONFIG)
     assert kept == [5]
     assert len(new) == 1
     assert np.ptp(new[0].vertices, axis=0) == pytest.approx([0.02, 1, 0.99])
@@ -158,10 +165,10 @@ def test_hulls_of_several_groups_merge_to_a_budget_and_keep_what_they_can():
 def test_fidelity_measures_gap_and_phantom():
     board = box("b", (0, 0, 0), (1, 1, 0.1))
     surface = Surface([board])
-    exact = fidelity(surface, [Hull(board.vertices, False)])
+    exact = measure_fidelity(surface, [ConvexShape(vertices=board.vertices, is_handle=False)])
     assert exact.gap_max == pytest.approx(0, abs=1e-9)
     assert exact.phantom_p95 < 0.004 and exact.phantom_share == 0
-    moved = fidelity(surface, [Hull(board.vertices + np.array([0, 0, 0.03]), False)])
+    moved = measure_fidelity(surface, [ConvexShape(vertices=board.vertices + np.array([0, 0, 0.03]), is_handle=False)])
     assert moved.gap_max == pytest.approx(0.03, abs=1e-3)
     assert moved.phantom_max == pytest.approx(0.03, abs=4e-3)
     assert 0.3 < moved.phantom_share < 0.8
@@ -172,7 +179,7 @@ def test_fidelity_measures_gap_and_phantom():
 def test_distances_to_the_surface_are_right_to_the_sample_spacing(seed):
     rng = np.random.default_rng(seed)
     mesh = trimesh.Trimesh(rng.uniform(0, 1, (9, 3)), np.arange(9).reshape(3, 3), process=False)
-    surface = Surface([Visual("t", np.asarray(mesh.vertices), np.asarray(mesh.faces), False, None)])
+    surface = Surface([leaf("t", np.asarray(mesh.vertices), np.asarray(mesh.faces))])
     points = rng.uniform(0, 1, (200, 3))
     _, expected, _ = trimesh.proximity.closest_point_naive(mesh, points)
     found = surface.distance(points)[expected < 0.05]
@@ -183,11 +190,11 @@ def test_distances_to_the_surface_are_right_to_the_sample_spacing(seed):
 def test_real_parts_are_covered_and_free_of_phantoms(real_objects):
     for name in ("45194", "101619"):
         obj = read_object(real_objects / name)
-        moving = [p.link for p in parts(obj)[0]]
+        moving = [p.link for p in detect_parts(obj)[0]]
         for group in (obj.root, *moving):
             surface = Surface(obj.group_visuals(group))
             hulls = decompose(surface, 32 if group == obj.root else 16, CONFIG)
-            match = fidelity(surface, hulls)
+            match = measure_fidelity(surface, hulls)
             assert match.gap_max < 0.005, (name, group)
             assert match.phantom_share < (0.05 if group == obj.root else 0.02), (name, group)
             assert max(len(h.vertices) for h in hulls) <= 32

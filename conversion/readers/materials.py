@@ -6,7 +6,6 @@ MuJoCo reads PNG alone, so images are made PNG here, as bytes that two materials
 from __future__ import annotations
 
 import io
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -14,25 +13,6 @@ from PIL import Image
 
 MAX_PIXELS = 2**26  # an image that claims more is damage
 FORMATS = ("PNG", "JPEG", "BMP", "GIF")
-
-
-@dataclass(frozen=True)
-class Material:
-    rgba: tuple[float, float, float, float]
-    png: bytes | None  # its picture; the colour is white then
-
-
-@dataclass(frozen=True)
-class Skin:
-    """What the faces of a visual look like."""
-
-    materials: tuple[Material | None, ...]  # None: nothing is known, the colour goes by role
-    material: np.ndarray  # [m] int64 per face, index into materials
-    uv: np.ndarray  # [m, 3, 2] float64 per corner of a face, origin at the lower left of the picture
-
-    def of(self, faces: np.ndarray) -> Skin:
-        """That of some faces [k], by index."""
-        return Skin(self.materials, self.material[faces], self.uv[faces])
 
 
 def read_mtl(text: str) -> dict[str, tuple[tuple[float, float, float, float], str | None]]:

@@ -3,60 +3,29 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
-import trimesh
 from scipy.sparse.csgraph import connected_components
 from scipy.spatial import ConvexHull
-from trimesh.ray.ray_pyembree import RayMeshIntersector
 
-from conversion.boxes import boxes
-from conversion.decompose import DecomposeConfig, Surface, decompose
-from conversion.partnet import Hull, Part, PartNetObject, Visual
+from conversion.model import ArticulatedObject, ConvexShape, Part, Visual
+from conversion.raycast import first_triangle
 
 FINGER = 0.012  # thickness and width of the finger that must pass, unit lengths
 SPACING = 0.003  # of the rays
-FINER = 1, 3, 8  # shares of the handles' tolerances that are tried in turn
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Handle:
     link: str
     name: str  # of its first visual
-    visual: bool  # a finger passes behind it in the visual mesh
-    hulls: bool  # and behind its hulls
+    clear_in_mesh: bool  # a finger passes behind it in the visual mesh
+    clear_in_hulls: bool  # and behind its hulls
 
 
-def shapes(
-    obj: PartNetObject, part: Part | None, surface: Surface, budget: int, collision: str, config: DecomposeConfig
-) -> tuple[list[Hull], list[Handle]]:
-    """Collision geometry ("hull" or "box") of one group, and the handles on it where it is a part's.
-
-    Handles through which a finger would no longer pass are made finer, and what is beside them too.
-    """
-    best: tuple[list[Hull], list[Handle]] = [], []
-    fewest = np.inf
-    for finer in FINER:
-        fine = replace(
-            config,
-            handle_tolerance=config.handle_tolerance / finer,
-            handle_merge_tolerance=config.handle_merge_tolerance / finer,
-        )
-        hulls = decompose(surface, budget, fine)
-        if collision == "box":
-            hulls = boxes(surface, hulls, 2 * budget, fine)
-        found = handles(obj, part, hulls) if part else []
-        lost = sum(h.visual and not h.hulls for h in found)
-        if lost < fewest:
-            best, fewest = (hulls, found), lost
-        if not lost:
-            break
-    return best
-
-
-def handles(obj: PartNetObject, part: Part, hulls: Sequence[Hull]) -> list[Handle]:
-    """Every handle of a door or drawer with these hulls. Bars only count where a finger passes across them."""
+def check_finger_clearance(obj: ArticulatedObject, part: Part, hulls: Sequence[ConvexShape]) -> list[Handle]:
+    """Every handle of a moving part with these hulls. Bars only count where a finger passes across them."""
     out = []
     visuals = obj.group_visuals(part.link)
     seen = _triangles([v for v in visuals if not v.is_handle])
@@ -66,13 +35,13 @@ def handles(obj: PartNetObject, part: Part, hulls: Sequence[Hull]) -> list[Handl
         behind = _behind(obj, part, bar, seen)
         low, high = bar.reshape(-1, 3).min(axis=0) - 0.01, bar.reshape(-1, 3).max(axis=0) + 0.01
         own = [h for h in solid[True] if ((h.max(axis=0) >= low) & (h.min(axis=0) <= high)).all()]
-        visual = passes(bar, bar, seen, behind)
-        kept = visual and passes(bar, _surface(own), _surface(solid[False]), behind)
-        out.append(Handle(part.link, group[0].name, visual, kept))
+        in_mesh = finger_passes(bar, bar, seen, behind)
+        in_hulls = in_mesh and finger_passes(bar, _surface(own), _surface(solid[False]), behind)
+        out.append(Handle(link=part.link, name=group[0].name, clear_in_mesh=in_mesh, clear_in_hulls=in_hulls))
     return out
 
 
-def passes(bar: np.ndarray, handle: np.ndarray, rest: np.ndarray, behind: np.ndarray) -> bool:
+def finger_passes(bar: np.ndarray, handle: np.ndarray, rest: np.ndarray, behind: np.ndarray) -> bool:
     """Whether a finger passes between a handle and what it is mounted on, across the handle's longer side.
 
     bar: triangles [m, 3, 3] of the handle's visual, which say where to look. handle, rest: triangles of the handle and
@@ -107,9 +76,7 @@ def _first(triangles: np.ndarray, origins: np.ndarray, direction: np.ndarray) ->
     shape, origins = origins.shape[:-1], origins.reshape(-1, 3)
     out = np.full(len(origins), np.inf)
     if len(triangles):
-        faces = np.arange(3 * len(triangles)).reshape(-1, 3)
-        mesh = trimesh.Trimesh(triangles.reshape(-1, 3), faces, process=False)
-        hit = RayMeshIntersector(mesh).intersects_first(origins, np.broadcast_to(direction, origins.shape))
+        hit = first_triangle(triangles, origins, direction)
         rows = hit >= 0
         a, b, c = triangles[hit[rows]].transpose(1, 0, 2)
         normal = np.cross(b - a, c - a)
@@ -119,10 +86,10 @@ def _first(triangles: np.ndarray, origins: np.ndarray, direction: np.ndarray) ->
     return out.reshape(shape)
 
 
-def _behind(obj: PartNetObject, part: Part, bar: np.ndarray, rest: np.ndarray) -> np.ndarray:
-    """Direction, link frame, from a handle to its door or drawer."""
+def _behind(obj: ArticulatedObject, part: Part, bar: np.ndarray, rest: np.ndarray) -> np.ndarray:
+    """Direction, link frame, from a handle to its part."""
     axis = obj.joints[part.link].axis
-    if part.kind == "drawer":
+    if obj.joints[part.link].type == "prismatic":
         return -part.sign * axis
     centre = bar.reshape(-1, 3).mean(axis=0)
     middle = rest.reshape(-1, 3).mean(axis=0) if len(rest) else centre

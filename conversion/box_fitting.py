@@ -8,25 +8,26 @@ from collections.abc import Sequence
 import numpy as np
 from scipy.spatial import ConvexHull, QhullError
 
-from conversion.decompose import DecomposeConfig, Surface
-from conversion.partnet import Hull
+from conversion.config import DecomposeConfig
+from conversion.model import ConvexShape
+from conversion.surface import Surface
 
 # Corners in units of the half extents, and the 12 triangles between them.
 CORNERS = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], np.float64)
 _FACES = ConvexHull(CORNERS).simplices
 
 
-def boxes(surface: Surface, hulls: Sequence[Hull], limit: int, config: DecomposeConfig) -> list[Hull]:
+def fit_boxes(surface: Surface, hulls: Sequence[ConvexShape], limit: int, config: DecomposeConfig) -> list[ConvexShape]:
     """A box around each hull, where it reaches too far into free space around each of its halves, and so on.
 
     Ends when all boxes are within the tolerance, or there are `limit` of them.
     """
-    queue: list[tuple[float, int, np.ndarray, Hull]] = []
+    queue: list[tuple[float, int, np.ndarray, ConvexShape]] = []
     count = 0
 
     def add(points: np.ndarray, is_handle: bool) -> None:
         nonlocal count
-        box = fitted(points, is_handle, config.thickness)
+        box = fit_box(points, is_handle, config.thickness)
         tolerance = config.handle_tolerance if is_handle else config.tolerance
         samples, _ = surface.sample(box.vertices[_FACES], 200)
         excess = float(surface.phantom(samples).max()) / tolerance
@@ -44,7 +45,7 @@ def boxes(surface: Surface, hulls: Sequence[Hull], limit: int, config: Decompose
     return [entry[3] for entry in sorted(queue, key=lambda entry: entry[1])]
 
 
-def fitted(points: np.ndarray, is_handle: bool, thickness: float) -> Hull:
+def fit_box(points: np.ndarray, is_handle: bool, thickness: float) -> ConvexShape:
     """The smallest box around points [n, 3] that has a side in a face of their hull."""
     try:
         hull = ConvexHull(points)
@@ -78,10 +79,11 @@ def fitted(points: np.ndarray, is_handle: bool, thickness: float) -> Hull:
     size = np.maximum((high - low) / 2, thickness / 2)
     pose = np.eye(4)
     pose[:3, :3], pose[:3, 3] = frame.T, (low + high) / 2 @ frame
-    return Hull((CORNERS * size) @ frame + pose[:3, 3], is_handle, pose, size)
+    corners = (CORNERS * size) @ frame + pose[:3, 3]
+    return ConvexShape(vertices=corners, is_handle=is_handle, box_pose=pose, box_size=size)
 
 
-def _halves(points: np.ndarray, box: Hull) -> list[np.ndarray]:
+def _halves(points: np.ndarray, box: ConvexShape) -> list[np.ndarray]:
     """Convex points cut through the middle of their box, across its longest side."""
     assert box.box_pose is not None and box.box_size is not None
     k = int(box.box_size.argmax())

@@ -12,10 +12,11 @@ from generated import box, joint, made, read_with_hulls
 from scipy.spatial import ConvexHull
 from scipy.spatial.transform import Rotation
 
-from conversion.partnet import ConvertedObject, Hull, ObjectError
-from conversion.scenes import other_values, scene_bank
+from conversion.model import ConvertedObject, ConvexShape, ObjectError
+from conversion.scenes import other_values, scene_bank, scene_specs
 from mjcf_assets.procedural.generate import generate
-from vatmart_jax.data.banks import HINGE, SLIDE, SceneBank, Scenes
+from vatmart_jax.data.banks import SceneBank, SceneTable
+from vatmart_jax.data.part_kinds import HINGE, SLIDE
 
 # One of each quirk: ranges that exclude 0, go below it, or start past it; buttons on a door; a plain cabinet.
 REAL = ("103480", "12428", "11826", "101564", "45194", "8877")
@@ -35,7 +36,11 @@ def objects(folder) -> list[ConvertedObject]:
 
 @pytest.fixture(scope="module")
 def bank(objects) -> SceneBank:
-    return scene_bank(objects, 3, "hull", seed=0)
+    return bank_of(objects, 3)
+
+
+def bank_of(objects: list[ConvertedObject], variants: int, collision: str = "hull") -> SceneBank:
+    return scene_bank([spec for o in objects for spec in scene_specs(o, variants, seed=0)], collision)
 
 
 def part_pose(bank: SceneBank, s: int, q: float) -> np.ndarray:
@@ -72,7 +77,7 @@ def check_against_urdf(folder: Path, converted: ConvertedObject, bank: SceneBank
         part = parts[bank.part[s]]
         values = other_values(converted, part, int(bank.variant[s]), seed)
         assert bank.joint[s] == part.joint and bank.joint[s] not in values
-        for q in np.linspace(0, bank.width[s], 5):
+        for q in np.linspace(0, bank.joint_range[s], 5):
             config = values | {part.joint: bank.urdf_closed[s] + bank.urdf_sign[s] * q}
             urdf.update_cfg({k: config[k] for k in urdf.actuated_joint_names})
             pose = urdf.get_transform(part.link, converted.obj.root)
@@ -95,7 +100,7 @@ def test_scenes_agree_with_the_urdf(folder, objects, bank):
 @pytest.mark.parametrize("name", REAL)
 def test_scenes_of_real_objects_agree_with_the_urdf(real_objects, name):
     converted = read_with_hulls(real_objects / name)
-    bank = scene_bank([converted], 2, "hull", seed=0)
+    bank = bank_of([converted], 2)
     assert len(bank) >= len(converted.parts) > 0
     check_against_urdf(real_objects / name, converted, bank, seed=0)
 
@@ -105,7 +110,7 @@ def test_axes_point_so_that_positive_opens(bank):
 
     Leaves in a frame open to either side, and furniture that is used from the side opens there.
     """
-    axis = np.asarray(Scenes.of(bank).axis)
+    axis = np.asarray(SceneTable.from_bank(bank).axis)
     for s in range(len(bank)):
         closed, ajar = (np.concatenate(solids(bank, s, q)[1]).mean(0) for q in (0.0, 0.05))
         moved = ajar - closed
@@ -125,6 +130,7 @@ def test_every_part_has_its_scenes_and_variant_0_first(objects, bank):
             variants = bank.variant[own].tolist()
             assert variants[0] == 0 and variants == sorted(set(variants)) and len(variants) <= 3
             assert set(bank.joint_type[own]) == {SLIDE if part.kind == "drawer" else HINGE}
+            assert set(bank.part_kind[own]) == {part.kind}
             assert set(bank.split[own]) == {"train"} and set(bank.category[own]) == {converted.obj.category}
 
 
@@ -163,7 +169,7 @@ def test_variants_leave_the_part_its_room(bank):
         base = np.flatnonzero(
             (bank.object_id == bank.object_id[s]) & (bank.part == bank.part[s]) & (bank.variant == 0)
         )[0]
-        for q in np.linspace(0, bank.width[s], 9):
+        for q in np.linspace(0, bank.joint_range[s], 9):
             assert overlap(bank, s, q) <= max(overlap(bank, base, q), 0) + 3e-3, (bank.object_id[s], bank.part[s], q)
 
 
@@ -204,7 +210,7 @@ def test_handles_are_marked(objects, bank):
 
 
 def test_scenes_do_not_depend_on_their_neighbours(objects, bank):
-    alone = scene_bank([objects[5]], 3, "hull", seed=0)
+    alone = bank_of([objects[5]], 3)
     together = bank.select(bank.object_id == objects[5].obj.id)
     for field in fields(SceneBank):
         np.testing.assert_array_equal(getattr(alone, field.name), getattr(together, field.name), field.name)
@@ -223,22 +229,23 @@ def test_banks_come_back_from_their_file(bank, tmp_path):
 
 def test_objects_without_parts_give_an_empty_bank():
     converted = made("block", {"base": [box("body-1", (0, 0, 0), (1, 1, 1))]}, [])
-    bank = scene_bank([converted], 2, "hull", seed=0)
+    bank = bank_of([converted], 2)
     assert len(bank) == 0 and bank.part_quat.shape == (0, 4) and len(bank.static_start) == 1
 
 
-def boxed(hull: Hull) -> Hull:
+def boxed(hull: ConvexShape) -> ConvexShape:
     """Its axis-aligned bounding box."""
     low, high = hull.vertices.min(0), hull.vertices.max(0)
     pose = np.eye(4)
     pose[:3, 3] = (low + high) / 2
     corners = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
-    return Hull(corners * (high - low) / 2 + pose[:3, 3], hull.is_handle, pose, (high - low) / 2)
+    vertices = corners * (high - low) / 2 + pose[:3, 3]
+    return ConvexShape(vertices=vertices, is_handle=hull.is_handle, box_pose=pose, box_size=(high - low) / 2)
 
 
 def test_box_banks_place_the_same_corners(objects):
     as_boxes = [replace(o, hulls={g: [boxed(h) for h in hulls] for g, hulls in o.hulls.items()}) for o in objects[:3]]
-    boxes, hulls = (scene_bank(as_boxes, 2, kind, seed=0) for kind in ("box", "hull"))
+    boxes, hulls = (bank_of(as_boxes, 2, kind) for kind in ("box", "hull"))
     assert len(boxes.hull_vertices) == 0 and len(boxes.box_size) == len(hulls.hull_start) - 1
     corners = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
     for r in range(len(boxes.instance_shape)):
@@ -250,4 +257,4 @@ def test_box_banks_place_the_same_corners(objects):
 
 def test_a_box_bank_of_hulls_is_refused(objects):
     with pytest.raises(ObjectError, match=f"{objects[0].obj.id}: .* convert with --collision box"):
-        scene_bank(objects, 1, "box", seed=0)
+        bank_of(objects, 1, "box")

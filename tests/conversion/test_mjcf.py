@@ -11,8 +11,9 @@ import pytest
 import yourdfpy
 from generated import box, joint, made, read_with_hulls
 
-from conversion.mjcf import COLLISION_GROUP, VISUAL_GROUP, Mjcf, MjcfConfig, to_mjcf
-from conversion.partnet import ConvertedObject, Hull, Joint, ObjectError
+from conversion.config import MjcfConfig
+from conversion.mjcf import COLLISION_GROUP, VISUAL_GROUP, Mjcf, to_mjcf
+from conversion.model import ConvertedObject, ConvexShape, ObjectError
 from mjcf_assets.procedural.generate import generate
 
 REAL = ("45194", "103480", "101612", "11826", "10144", "12249", "22301", "12428")
@@ -184,7 +185,7 @@ def test_links_without_geometry_and_helpers_keep_their_bodies():
         {"base": [box("body", (0, 0, 0), (1, 1, 1))], "ghost": [], "tip": [box("tip", (2, 0, 0), (3, 1, 1))]},
         [
             joint("ghost", "revolute", (0, 0, 1), 0, 1),
-            Joint("on", "revolute", "ghost", "tip", np.eye(4), np.array([0, 1.0, 0]), 0, 1),
+            replace(joint("tip", "revolute", (0, 1, 0), 0, 1), parent="ghost"),
         ],
     )
     model = model_of(replace(empty, hulls={"base": empty.hulls["base"], "ghost": [], "tip": empty.hulls["tip"]}))
@@ -196,7 +197,8 @@ def test_boxes_stand_where_their_corners_are():
     converted = made("one", {"base": [box("body", (0, 0, 0), (1, 2, 3))]}, [])
     pose = np.eye(4)
     pose[:3, 3] = (0.5, 1, 1.5)
-    hull = Hull(converted.hulls["base"][0].vertices, False, pose, np.array([0.5, 1, 1.5]))
+    corners = converted.hulls["base"][0].vertices
+    hull = ConvexShape(vertices=corners, is_handle=False, box_pose=pose, box_size=np.array([0.5, 1, 1.5]))
     model = model_of(replace(converted, hulls={"base": [hull]}))
     geom = model.geom("base/hull_0")
     assert geom.type[0] == mujoco.mjtGeom.mjGEOM_BOX
@@ -211,5 +213,5 @@ def test_a_written_model_opens_from_its_folder(tmp_path):
 
 def test_what_mujoco_refuses_is_said_in_one_line():
     with pytest.raises(ObjectError, match="MuJoCo does not compile the model: ") as caught:
-        Mjcf("<mujoco><worldbody><geom size='-1'/></worldbody></mujoco>", {}).compile()
+        Mjcf(xml="<mujoco><worldbody><geom size='-1'/></worldbody></mujoco>", assets={}).compile()
     assert "\n" not in str(caught.value)
