@@ -20,7 +20,7 @@ from mjcf_assets.procedural.generate import generate
 from vatmart_jax.cli.main import COMMANDS, main
 from vatmart_jax.data.banks import SceneBank, ViewBank
 from vatmart_jax.data.dataset import Data
-from vatmart_jax.envs.env import TASKS, EnvConfig
+from vatmart_jax.envs import TASKS, EnvConfig
 from vatmart_jax.perception.networks import NetworksConfig
 from vatmart_jax.perception.pointnet2 import LocalGroup, PointNet2Config, SetAbstraction
 from vatmart_jax.perception.trainer import PerceptionConfig

@@ -113,7 +113,7 @@ def _train(argv: list[str]) -> None:
     args = tyro.cli(Train, args=argv, prog="vatmart train")
     _enable_compilation_cache()
     from vatmart_jax.data.dataset import Data
-    from vatmart_jax.physics.types import default_impl
+    from vatmart_jax.physics import default_impl
     from vatmart_jax.pipeline.run_dir import check_folder
     from vatmart_jax.reporting import ConsoleReporter
     from vatmart_jax.workflows.train import resolve, train
@@ -159,7 +159,7 @@ def _evaluate(argv: list[str]) -> None:
     if not args.run:
         raise UserError("no run; give one or more run folders of `vatmart train`")
     _enable_compilation_cache()
-    from vatmart_jax.physics.types import default_impl
+    from vatmart_jax.physics import default_impl
     from vatmart_jax.reporting import ConsoleReporter
     from vatmart_jax.workflows.evaluate import evaluate
 

@@ -12,7 +12,7 @@ from filelock import FileLock, Timeout
 
 from vatmart_jax import __version__
 from vatmart_jax.data.banks import SceneBank, ViewBank
-from vatmart_jax.envs.env import Env, EnvConfig, Task
+from vatmart_jax.envs import Env, EnvConfig, Task, make_env
 from vatmart_jax.errors import UserError
 from vatmart_jax.physics import PhysicsConfig
 
@@ -105,7 +105,7 @@ class Data:
         if len(chosen) == 0:
             raise DataError(f"{self.folder}: has no object of the split {split}; see splits.json")
         try:
-            return Env(self._scenes.select(chosen), self._views.of_scenes(chosen), task, impl, config, physics)
+            return make_env(self._scenes.select(chosen), self._views.of_scenes(chosen), task, impl, config, physics)
         except ValueError as e:
             raise DataError(f"{self.folder}, split {split}: {e}") from e
 

@@ -16,9 +16,9 @@ from vatmart_jax import __version__
 from vatmart_jax.atomic_io import write_bytes, write_json
 from vatmart_jax.config import to_json
 from vatmart_jax.data.dataset import SPLITS, Data, DataError
-from vatmart_jax.envs.env import TASKS, Env, Task
+from vatmart_jax.envs import TASKS, Env, Task
 from vatmart_jax.errors import require_one_of
-from vatmart_jax.physics.types import IMPLS
+from vatmart_jax.physics import BACKENDS
 from vatmart_jax.pipeline.presets import Settings
 from vatmart_jax.pipeline.run_config import FORMAT
 from vatmart_jax.pipeline.run_dir import RunDir, read_metrics
@@ -36,7 +36,7 @@ def resolve(
 ) -> dict[str, Any]:
     """The config that is written beside every result. Raises UserError for an unknown task or impl."""
     require_one_of("--task", task, TASKS)
-    require_one_of("--impl", impl, IMPLS)
+    require_one_of("--impl", impl, BACKENDS.names())
     return {
         "format": FORMAT,
         "version": __version__,
@@ -100,7 +100,7 @@ def train(
 def priors_config(settings: Settings, task: Task) -> PriorsConfig:
     """What a run with these settings makes priors of. Raises UserError for settings that make none."""
     networks = perception_config(settings, task).networks
-    return PriorsConfig(task.name, task.low, task.high, networks, settings.evaluation.num_augmentations)
+    return PriorsConfig(task.name, *task.goal_range, networks, settings.evaluation.num_augmentations)
 
 
 def environments(data: Data, task: Task, impl: str, settings: Settings) -> dict[str, Env]:
