@@ -8,16 +8,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from vatmart_jax.data.dataset import SPLITS, Data, DataError, prepare
+from vatmart_jax.data.cache import DataError, converted_folder
+from vatmart_jax.data.dataset import SPLITS, Data
 from vatmart_jax.envs.env import TASKS, EnvConfig
 from vatmart_jax.physics import PhysicsConfig
 
 
 def test_runs_that_start_at_once_prepare_one_after_the_other(tmp_path, monkeypatch):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
-    inside, most, found, said = 0, 0, [], []
+    inside, most, found, informed = 0, 0, [], []
 
-    def convert(source: Path, out: Path) -> None:
+    def convert(out: Path) -> None:
         nonlocal inside, most
         inside += 1
         most = max(most, inside)
@@ -25,7 +26,7 @@ def test_runs_that_start_at_once_prepare_one_after_the_other(tmp_path, monkeypat
         inside -= 1
 
     def run() -> None:
-        found.append(prepare(None, convert, lambda out: out.mkdir(exist_ok=True), said.append))
+        found.append(converted_folder(tmp_path / "objects", convert, informed.append))
 
     threads = [threading.Thread(target=run) for _ in range(4)]
     for thread in threads:
@@ -33,7 +34,7 @@ def test_runs_that_start_at_once_prepare_one_after_the_other(tmp_path, monkeypat
     for thread in threads:
         thread.join()
     assert most == 1 and len(found) == 4 and len(set(found)) == 1
-    assert len(said) == 3 and all("waiting for another run" in line for line in said)
+    assert len(informed) == 3 and all("waiting for another run" in line for line in informed)
 
 
 def test_more_folders_add_their_training_splits_and_nothing_else(cabinets, tmp_path):

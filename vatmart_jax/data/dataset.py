@@ -1,72 +1,19 @@
-"""Where training data comes from: a converted folder, a folder of objects, or the bundled generated objects."""
+"""The splits of a converted folder, and the training splits of more of them."""
 
 from __future__ import annotations
 
-import hashlib
-import os
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-from filelock import FileLock, Timeout
 
-from vatmart_jax import __version__
 from vatmart_jax.data.banks import SceneBank, ViewBank
+from vatmart_jax.data.cache import DataError
 from vatmart_jax.envs.env import Env, EnvConfig, Task
 from vatmart_jax.errors import UserError
 from vatmart_jax.physics import PhysicsConfig
 
-BUNDLED_COUNT, BUNDLED_SEED = 50, 0
 SPLITS = ("train", "test_shapes", "test_categories")
-
-
-_WANTED = "--data takes a folder of objects or what `vatmart convert` made of it"
-
-
-class DataError(UserError):
-    """A data folder cannot be used."""
-
-
-def cache_folder() -> Path:
-    """Where generated objects, conversions and compiled programs are kept between runs."""
-    base = os.environ.get("XDG_CACHE_HOME") or str(Path.home() / ".cache")
-    return Path(base) / "vatmart_jax"
-
-
-def prepare(
-    data: Path | None,
-    convert: Callable[[Path, Path], None],
-    generate: Callable[[Path], None],
-    say: Callable[[str], None] = lambda line: None,
-) -> Path:
-    """The converted folder (scenes.npz, views.npz) for `data`, made in the cache where it does not exist yet.
-
-    Of several runs that want the same data at once, one makes it; the others `say` that they wait, and do.
-
-    data: a converted folder, a folder of PartNet-Mobility objects, or None for the bundled objects.
-    convert(source, out) and generate(out) do the work. Raises DataError where `data` is neither.
-    """
-    source = data or cache_folder() / f"objects-{__version__}-{BUNDLED_COUNT}-{BUNDLED_SEED}"
-    if data is not None:
-        if not data.is_dir():
-            raise DataError(f"{data}: no such folder; {_WANTED}")
-        if (data / "scenes.npz").is_file():
-            return data
-        if (data / "mobility.urdf").is_file() or not any(data.glob("*/mobility*.urdf")):
-            raise DataError(f"{data}: holds neither scenes.npz nor object folders with a mobility.urdf; {_WANTED}")
-    out = cache_folder() / "converted" / hashlib.sha256(str(source.resolve()).encode()).hexdigest()[:16]
-    out.parent.mkdir(parents=True, exist_ok=True)
-    lock = FileLock(out.with_suffix(".lock"))
-    try:
-        held = lock.acquire(timeout=0)
-    except Timeout:
-        say(f"waiting for another run that converts {source}")
-        held = lock.acquire()
-    with held:
-        if data is None:
-            generate(source)
-        convert(source, out)
-    return out
 
 
 class Data:
@@ -106,7 +53,7 @@ class Data:
             raise DataError(f"{self.folder}: has no object of the split {split}; see splits.json")
         try:
             return Env(self._scenes.select(chosen), self._views.of_scenes(chosen), task, impl, config, physics)
-        except ValueError as e:
+        except UserError as e:
             raise DataError(f"{self.folder}, split {split}: {e}") from e
 
 

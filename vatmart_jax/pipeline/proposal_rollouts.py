@@ -19,18 +19,18 @@ def interactions_of(final: EnvState, trajectory: jax.Array | None = None) -> Int
     """The samples [B] that finished trials make; `trajectory` [B, 30] where the networks proposed it."""
     start = final.start
     return Interactions(
-        start.view,
-        start.contact,
-        start.goal,
-        final.trajectory if trajectory is None else trajectory,
-        final.displacement,
-        final.valid & final.grasp_held,
-        jnp.full(start.view.shape, trajectory is not None),
+        view=start.view,
+        contact=start.contact,
+        goal=start.goal,
+        trajectory=final.trajectory if trajectory is None else trajectory,
+        displacement=final.displacement,
+        valid=final.valid & final.grasp_held,
+        from_proposal=jnp.full(start.view.shape, trajectory is not None),
     )
 
 
-def curious(samples: Interactions, score: jax.Array, tolerance: float) -> Interactions:
-    """The samples that the curiosity stage teaches, the rest emptied (paper, appendix C).
+def select_curious(samples: Interactions, score: jax.Array, tolerance: float) -> Interactions:
+    """The samples that the curiosity stage trains on, the rest emptied (paper, appendix C).
 
     Successes are half surprising (score [B] below 0.5) and half expected ones, failures as many as successes.
     """
@@ -38,7 +38,7 @@ def curious(samples: Interactions, score: jax.Array, tolerance: float) -> Intera
     novel, known, failed = success & (score < 0.5), success & (score >= 0.5), ~success
     known &= jnp.cumsum(known) <= jnp.maximum(novel.sum(), 1)
     failed &= jnp.cumsum(failed) <= jnp.maximum((novel | known).sum(), 1)
-    return samples.replace(view=jnp.where(novel | known | failed, samples.view, -1))
+    return replace(samples, view=jnp.where(novel | known | failed, samples.view, -1))
 
 
 TASKS_PER_VIEW = 8
@@ -48,13 +48,13 @@ class ProposalTrials:
     """Executes what the networks propose in an environment whose views are `grouped_views`."""
 
     def __init__(self, env: Env, grouped_views: GroupedViews, predictor: TTAPredictor, proposals: int):
-        self._env, self._grouped_views, self._ensemble, self._proposals = env, grouped_views, predictor, proposals
+        self._env, self._grouped_views, self._predictor, self._proposals = env, grouped_views, predictor, proposals
         self._execute = jax.jit(self._executed)
         self._sample_by_view = jax.jit(self._sampled_by_view)
 
     def _executed(self, start: TrialStart, trajectory: jax.Array) -> EnvState:
         rotation, residuals = unpack_trajectory(trajectory)
-        return self._env.execute(start.replace(rotation=rotation), residuals)
+        return self._env.execute(replace(start, rotation=rotation), residuals)
 
     def _sampled_by_view(self, key: jax.Array) -> TrialStart:
         """A batch of starts in which every TASKS_PER_VIEW in a row share a view."""
@@ -70,7 +70,7 @@ class ProposalTrials:
         Consumes the key.
         """
         chosen = select_actions(
-            self._ensemble, params, self._grouped_views, start.view, start.goal, key, self._proposals
+            self._predictor, params, self._grouped_views, start.view, start.goal, key, self._proposals
         )
         final = self._execute(replace(start, contact=chosen.contact), chosen.trajectory)
         return final, chosen.trajectory, chosen.score
@@ -84,7 +84,7 @@ class ProposalTrials:
         start = self._sample_by_view(ks)
         rows = (-1, TASKS_PER_VIEW)
         contact, trajectory = explore_actions(
-            self._ensemble, params, self._grouped_views, start.view.reshape(rows)[:, 0], start.contact.reshape(rows),
+            self._predictor, params, self._grouped_views, start.view.reshape(rows)[:, 0], start.contact.reshape(rows),
             start.goal.reshape(rows), ke, self._proposals,
         )  # fmt: skip
         trajectory = trajectory.reshape(len(start.view), -1)

@@ -238,7 +238,7 @@ def _read_config(path: Path) -> tuple[PriorsConfig, int]:
             found = format_1.renamed(found, {"copies": "num_augmentations"})
             found["networks"] = format_1.networks_config(found["networks"])
         return from_json(PriorsConfig, found), written
-    except (OSError, ValueError, TypeError, KeyError, AttributeError) as e:
+    except (UserError, OSError, ValueError, TypeError, KeyError, AttributeError) as e:
         raise PriorsError(f"{path}: not a config of priors ({summarize_error(e)}); train or export them again") from e
 
 
