@@ -8,10 +8,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from vatmart_jax.data.cache import DataError, converted_folder
+from vatmart_jax import __version__
+from vatmart_jax.data.cache import DataError, bundled_folder, converted_folder
 from vatmart_jax.data.dataset import SPLITS, Data
 from vatmart_jax.envs.env import TASKS, EnvConfig
 from vatmart_jax.physics import PhysicsConfig
+from vatmart_jax.workflows.prepare import prepare
 
 
 def test_runs_that_start_at_once_prepare_one_after_the_other(tmp_path, monkeypatch):
@@ -59,3 +61,32 @@ def test_more_folders_add_their_training_splits_and_nothing_else(cabinets, tmp_p
     replace(views, points=views.points[:, :10]).save(tmp_path / "more" / "views.npz")
     with pytest.raises(DataError, match=r"own, .*more: cannot be trained on together: their views differ"):
         Data(*folders)
+
+
+def test_views_that_are_made_now_have_the_points_that_a_run_reads(tmp_path, monkeypatch):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    (tmp_path / "objects" / "1").mkdir(parents=True)
+    (tmp_path / "objects" / "1" / "mobility.urdf").write_text("")
+    asked = []
+
+    class Nothing:
+        failed = ()
+
+    def convert(sources, out, config):
+        asked.append((sources, config.points))
+        return Nothing
+
+    monkeypatch.setattr("vatmart_jax.workflows.prepare.convert", convert)
+    prepare(tmp_path / "objects", num_points=12_345)
+    assert asked == [([tmp_path / "objects"], 12_345)]
+
+
+def test_a_converted_folder_is_never_touched(cabinets, tmp_path, monkeypatch):
+    monkeypatch.setattr("vatmart_jax.workflows.prepare.convert", None)
+    cabinets[0].save(tmp_path / "scenes.npz")
+    assert prepare(tmp_path, num_points=12_345) == tmp_path
+
+
+def test_bundled_objects_are_made_again_for_another_version_of_the_generator():
+    assert bundled_folder(1, 50, 0) != bundled_folder(2, 50, 0)
+    assert __version__ not in bundled_folder(1, 50, 0).name

@@ -44,8 +44,10 @@ def main(argv: list[str] | None = None) -> None:
     """Entry point. Exit codes: 0 done, 2 bad input (one line on standard error), 130 stopped."""
     argv = sys.argv[1:] if argv is None else argv
     try:
-        _dispatch(argv)
-        sys.stdout.flush()
+        try:
+            _dispatch(argv)
+        finally:
+            sys.stdout.flush()  # here, where a closed pipe is no error, and not while Python exits
     except UserError as e:
         sys.exit(_fail(str(e)))
     except KeyboardInterrupt:
@@ -65,6 +67,7 @@ def _dispatch(argv: list[str]) -> None:
         print(__version__)
     elif argv[:1] in (["-h"], ["--help"]):
         print(_usage())
+        sys.exit(0)
     elif not argv or argv[0] not in COMMANDS:
         print(_usage(), file=sys.stderr)
         sys.exit(2)

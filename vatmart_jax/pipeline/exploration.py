@@ -82,7 +82,8 @@ class ExplorationLoop:
         """One batch of trials; from the pool if there is one, else from random starts. Consumes the key.
 
         noise: share of the action range; random: share of uniform actions; scripted: share of trials that the
-        scripted policy makes, with the same noise. Without `terminate_on_failure` trials that cannot succeed are acted out too:
+        scripted policy makes, with the same noise. Without `terminate_on_failure` trials that cannot succeed
+        are acted out too:
         perception learns from them.
         """
         kr, ke = jax.random.split(key)

@@ -94,7 +94,8 @@ class TD3:
         return jnp.where(jax.random.uniform(kr, (len(obs), 1)) < random, uniform, action)
 
     def update(self, state: TD3State, replay: ReplayBuffer, key: jax.Array) -> tuple[TD3State, dict[str, jax.Array]]:
-        """`grad_steps_per_iter` gradient steps on the critics, one in `policy_delay` on the policy too. Consumes the key."""
+        """`grad_steps_per_iter` gradient steps on the critics, one in `policy_delay` on the policy too. Consumes the
+        key."""
 
         def step(state, key):
             ks, kn = jax.random.split(key)
