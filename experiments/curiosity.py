@@ -21,9 +21,10 @@ from vatmart_jax.errors import UserError, require_one_of, require_positive
 from vatmart_jax.evaluation.metrics import wilson_interval
 from vatmart_jax.physics import default_impl
 from vatmart_jax.pipeline.presets import PRESETS
-from vatmart_jax.pipeline.run_dir import read_config, read_metrics
+from vatmart_jax.pipeline.run_config import DataSource, RunConfig
+from vatmart_jax.pipeline.run_dir import read_metrics
 from vatmart_jax.reporting import ConsoleReporter
-from vatmart_jax.workflows.train import resolve, train
+from vatmart_jax.workflows.train import train
 
 
 @dataclass(frozen=True)
@@ -44,11 +45,14 @@ def run(args: Curiosity, seed: int, weight: float, out: Path, bars: ConsoleRepor
     """What a run's result.json says, after the run where there is none yet."""
     settings = PRESETS[args.preset]
     settings = replace(settings, schedule=replace(settings.schedule, curiosity_weight=weight))
-    config = resolve(args.task, args.preset, default_impl(), seed, settings, args.data)
-    if (out / "result.json").is_file() and read_config(out) == config:
+    config = RunConfig(
+        task=args.task, data=DataSource.of(args.data), preset=args.preset, impl=default_impl(), seed=seed,
+        settings=settings,
+    )  # fmt: skip
+    if (out / "result.json").is_file() and RunConfig.load(out) == config:
         return json.loads((out / "result.json").read_text())
-    bars.say(f"{out.name}: seed {seed}, curiosity weight {weight:g}")
-    result, _ = train(config, settings, Data(args.data), out, bars)
+    bars.info(f"{out.name}: seed {seed}, curiosity weight {weight:g}")
+    result, _ = train(config, Data(args.data), out, bars)
     return result
 
 

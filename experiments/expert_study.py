@@ -4,7 +4,7 @@ vatmart convert REAL --out DATA; python experiments/expert_study.py --data DATA 
 """
 
 import sys
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -14,11 +14,12 @@ import tyro
 
 from vatmart_jax.atomic_io import write_json
 from vatmart_jax.data.dataset import Data
-from vatmart_jax.envs import TASKS, Env, EnvConfig
+from vatmart_jax.envs import TASKS, Env, EnvConfig, get_task
 from vatmart_jax.envs.scripted_policy import scripted_action, scripted_start
 from vatmart_jax.evaluation.metrics import wilson_interval
-from vatmart_jax.physics import PhysicsConfig
+from vatmart_jax.pipeline.settings import Settings
 from vatmart_jax.trajectory import WAYPOINTS
+from vatmart_jax.workflows.environments import split_environments
 
 
 @dataclass(frozen=True)
@@ -39,7 +40,7 @@ def main(args: Study) -> None:
     data, found = Data(args.data), {}
     for task in args.tasks:
         for split in args.splits:
-            env = data.env(split, TASKS[task], "c", args.env, PhysicsConfig())
+            env = split_environments(data, get_task(task), "c", replace(Settings(), env=args.env))[0][split]
             found.setdefault(task, {})[split] = result = study(env, args.trials, args.seed)
             print(task, split, {k: v for k, v in result.items() if k != "worst"}, file=sys.stderr, flush=True)
             write_json(args.out, {"seed": args.seed, "tasks": found})

@@ -20,18 +20,19 @@ import jax.numpy as jnp
 import tyro
 
 from vatmart_jax.atomic_io import write_json
-from vatmart_jax.config import to_json
 from vatmart_jax.data.dataset import Data
-from vatmart_jax.envs import TASKS
+from vatmart_jax.envs import get_task
 from vatmart_jax.errors import UserError
+from vatmart_jax.evaluation.methods.base import EvalContext
 from vatmart_jax.physics import default_impl
-from vatmart_jax.pipeline.run_config import settings_of
-from vatmart_jax.pipeline.run_dir import RunDir, read_config
-from vatmart_jax.pipeline.trainer import STAGES, PipelineTrainer, run_seconds
+from vatmart_jax.pipeline.run_config import RunConfig
+from vatmart_jax.pipeline.run_dir import RunDir
+from vatmart_jax.pipeline.trainer import PipelineTrainer
 from vatmart_jax.priors.priors import Priors
 from vatmart_jax.reporting import ConsoleReporter
+from vatmart_jax.workflows.environments import split_environments
 from vatmart_jax.workflows.evaluate import evaluate_split
-from vatmart_jax.workflows.train import environments, priors_config
+from vatmart_jax.workflows.train import priors_config
 
 
 @dataclass(frozen=True)
@@ -64,15 +65,15 @@ def changed(settings: Any, field: str, text: str) -> Any:
 
 
 def main(args: Study) -> None:
-    described = read_config(args.run)
-    settings = settings_of(described)
-    task = TASKS[described["task"]]
-    data = Data(args.data, *map(Path, described["more_data"]))  # the run's trials name its views by number
-    envs = environments(data, task, default_impl(), settings)
+    described = RunConfig.load(args.run)
+    settings = described.settings
+    task = get_task(described.task)
+    data = Data(args.data, *map(Path, described.more_data))  # the run's trials name its views by number
+    envs, _ = split_environments(data, task, default_impl(), settings, required=("train",))
     results = []
     with ConsoleReporter() as bars:
-        with RunDir(args.run, described) as run:
-            training = PipelineTrainer(run, envs["train"], settings, described["seed"], bars)
+        with RunDir(args.run, described.to_json()) as run:
+            training = PipelineTrainer(run, envs["train"], settings, seed=described.seed, reporter=bars)
             done = run.restore(training.init_state())
         for variant in args.variants:
             label, _, changes = variant.partition(":")
@@ -80,22 +81,21 @@ def main(args: Study) -> None:
             for change in filter(None, changes.split(",")):
                 field, _, text = change.partition("=")
                 own = changed(own, field, text)
-            config = {**described, "settings": to_json(own), "trials_of": str(args.run)}
+            config = {**replace(described, settings=own).to_json(), "trials_of": str(args.run)}
             with RunDir(args.out / label, config) as run:
-                training = PipelineTrainer(run, envs["train"], own, described["seed"], bars)
+                training = PipelineTrainer(run, envs["train"], own, seed=described.seed, reporter=bars)
                 begun = training.init_state().replace(
                     explore=done.explore, samples=done.samples, stored=done.stored,
-                    stage=jnp.int32(STAGES.index("flow")),
+                    stage=jnp.int32(own.schedule.stages.index("flow")),
                 )  # fmt: skip
                 progress = training.train(begun)
             priors = Priors(priors_config(own, task), progress.perception.params)
             rows = []
             for number, (split, env) in enumerate(envs.items()):
                 key = jax.random.fold_in(jax.random.key(args.seed), number)
-                rows += evaluate_split(
-                    split, env, priors, ("ours",), args.trials, own.evaluation.num_proposals, key, bars
-                )
-            results.append({"variant": variant, "seconds": run_seconds(progress), "downstream": rows})
+                context = EvalContext(env=env, priors=priors, num_proposals=own.evaluation.num_proposals)
+                rows += evaluate_split(split, context, ("ours",), trials=args.trials, key=key, reporter=bars)
+            results.append({"variant": variant, "seconds": training.run_seconds(progress), "downstream": rows})
             write_json(args.out / "study.json", {"task": task.name, "seed": args.seed, "variants": results})
 
 

@@ -20,7 +20,7 @@ import numpy as np
 import tyro
 
 from vatmart_jax.atomic_io import write_json
-from vatmart_jax.bench.benchmarks import Choice, device, random_trials
+from vatmart_jax.bench.common import SceneSubset, device, noisy_scripted_trials
 from vatmart_jax.data.banks import SceneBank, ViewBank
 from vatmart_jax.envs import TASKS, Env, EnvConfig, EnvState, TrialStart, make_env
 from vatmart_jax.envs.scripted_policy import run_scripted_policy
@@ -152,7 +152,7 @@ def study(args: Study, name: str, bank: SceneBank, views: ViewBank) -> dict[str,
     env, finer = make(config), make(halved)
     k_start, k_noise, k_any, k_track = jax.random.split(jax.random.key(args.seed), 4)
     start = start_pool(env, k_start, args.trials)
-    noisy = jax.jit(partial(random_trials, env))(start, k_noise)
+    noisy = jax.jit(partial(noisy_scripted_trials, env))(start, k_noise)
     result = {
         "scenes": len(np.unique(noisy.physics.scene)),
         "time_step_halved": {
@@ -169,7 +169,7 @@ def study(args: Study, name: str, bank: SceneBank, views: ViewBank) -> dict[str,
 
 def main(args: Study) -> None:
     begun = time.monotonic()
-    bank, views = Choice(args.data, args.split).banks(args.seed)
+    bank, views = SceneSubset(args.data, args.split).banks(args.seed)
     result: dict[str, Any] = {
         "trials_per_task": args.trials, "split": args.split, "collision": bank.collision, "seed": args.seed,
         "device": device(),

@@ -5,14 +5,15 @@ python experiments/pretrain.py --run RUN --name push-door
 
 import json
 import shutil
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import tyro
 
-from vatmart_jax import pretrained
 from vatmart_jax.atomic_io import atomic_directory, write_json
-from vatmart_jax.pipeline.run_dir import read_config, read_metrics
+from vatmart_jax.pipeline.run_config import EXTERNAL, RunConfig
+from vatmart_jax.pipeline.run_dir import read_metrics
+from vatmart_jax.priors import pretrained
 from vatmart_jax.priors.priors import Priors
 
 RESULTS = Path(__file__).parent / "results"
@@ -28,12 +29,14 @@ class Pretrain:
 
 
 def main(args: Pretrain) -> None:
-    config = {**read_config(args.run), "data": None, "more_data": []}  # where the objects lay is nobody's business
+    # Where the objects lay is nobody's business.
+    config = replace(RunConfig.load(args.run), data=EXTERNAL, more_data=()).to_json()
     priors = Priors.load(args.run)
     with atomic_directory(pretrained.FOLDER / args.name) as folder:
         write_json(folder / "config.json", config)
         priors.save(folder / "priors")
-        shutil.copyfile(args.run / "policy.msgpack", folder / "policy.msgpack")
+        for name in ("policy.msgpack", "policy.json"):
+            shutil.copyfile(args.run / name, folder / name)
     result = json.loads((args.run / "result.json").read_text()) | {"run": args.name}
     lines = read_metrics(args.run)
     for stage in ("explore", "finetune"):

@@ -18,11 +18,10 @@ from vatmart_jax.data.dataset import Data
 from vatmart_jax.envs import TASKS, Env, TrialStart
 from vatmart_jax.pipeline.exploration import ExplorationLoop
 from vatmart_jax.pipeline.proposal_rollouts import interactions_of
-from vatmart_jax.pipeline.run_config import settings_of
-from vatmart_jax.pipeline.run_dir import read_config
+from vatmart_jax.pipeline.run_config import RunConfig, load_run_policy
 from vatmart_jax.priors.pretrained import run_folder
 from vatmart_jax.trajectory import unpack_trajectory
-from vatmart_jax.workflows.evaluate import load_policy
+from vatmart_jax.workflows.environments import split_environments
 
 
 @dataclass(frozen=True)
@@ -46,13 +45,14 @@ class ReplayBuffer:
 
 def main(args: ReplayBuffer) -> None:
     folder = run_folder(args.priors)
-    config = read_config(folder)
-    settings, task = settings_of(config), TASKS[config["task"]]
+    config = RunConfig.load(folder)
+    settings, task = config.settings, TASKS[config.task]
+    agent, policy = load_run_policy(folder)
     found = {}
     for split in args.splits:
-        env = Data(args.data).env(split, task, "c", settings.env, settings.physics)
-        explorer = ExplorationLoop(env, settings.explore)
-        found[split] = study(args, env, explorer, load_policy(folder, explorer))
+        env = split_environments(Data(args.data), task, "c", settings)[0][split]
+        explorer = ExplorationLoop(env, settings.explore, agent)
+        found[split] = study(args, env, explorer, policy)
         print(split, found[split], file=sys.stderr, flush=True)
         write_json(args.out, {"priors": str(args.priors), "seed": args.seed, "splits": found})
 
@@ -69,7 +69,7 @@ def study(args: ReplayBuffer, env: Env, explorer: ExplorationLoop, policy: Any) 
     successes, wins, distances = 0, Counter[str](), []
     for batch in range(args.batches):
         k_run, k_noise = jax.random.split(jax.random.fold_in(jax.random.key(args.seed), batch))
-        final, _ = explorer.rollout(policy, None, k_run, 0.05, 0.0, terminate_on_failure=False)
+        final, _ = explorer.rollout(policy, None, k_run, noise=0.05, terminate_on_failure=False)
         start, made = final.start, interactions_of(final)
         won, trajectory = made.success(tolerance), made.trajectory
         successes += int(won.sum())

@@ -58,14 +58,18 @@ class Registry(Generic[T]):
 
     def get(self, name: str) -> T:
         """Raises UserError, which lists the known names, where there is none of this name."""
-        if name not in self._entries:
-            raise UserError(f"{self.kind} {name!r} is not known; use one of {', '.join(self._entries)}")
+        self.require(name)
         value = self._entries[name]
         if isinstance(value, str):
             module, _, attribute = value.partition(":")
             value = cast(T, getattr(importlib.import_module(module), attribute))
             self._entries[name] = value
         return value
+
+    def require(self, name: str) -> None:
+        """Raises UserError, which lists the known names, where there is none of this name. Imports nothing."""
+        if name not in self._entries:
+            raise UserError(f"{self.kind} {name!r} is not known; use one of {', '.join(self._entries)}")
 
     def names(self) -> tuple[str, ...]:
         return tuple(self._entries)

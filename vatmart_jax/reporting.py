@@ -1,15 +1,39 @@
-"""Progress on standard error: bars in a terminal, now and then a line in a log."""
+"""Progress and messages of long jobs: a protocol, bars in a terminal or now and then a line in a log, and silence."""
 
 from __future__ import annotations
 
 import time
+from collections.abc import Mapping
+from typing import Protocol
 
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeRemainingColumn
 
 
+class Reporter(Protocol):
+    """Where a job reports to."""
+
+    def progress(self, stage: str, done: int, total: int, metrics: Mapping[str, float] | None = None) -> None:
+        """`done` of `total` units of a stage; `metrics`: the few that are worth showing."""
+        ...
+
+    def info(self, text: str) -> None:
+        """One line for whoever watches."""
+        ...
+
+
+class NullReporter:
+    """Reports nothing."""
+
+    def progress(self, stage: str, done: int, total: int, metrics: Mapping[str, float] | None = None) -> None:
+        pass
+
+    def info(self, text: str) -> None:
+        pass
+
+
 class ConsoleReporter:
-    """One bar per stage; call it with (stage, done, total, metrics). Use as a context manager."""
+    """One bar per stage on standard error; in a log a line every few seconds. Use as a context manager."""
 
     _SECONDS_BETWEEN_LINES = 10.0
 
@@ -30,9 +54,8 @@ class ConsoleReporter:
         if self._terminal:
             self._progress.stop()
 
-    def __call__(self, stage: str, done: int, total: int, metrics: dict[str, float]) -> None:
-        shown = ("success", "reward", "loss", "score_loss", "kl_loss", "actionability_loss", "valid")
-        note = "  ".join(f"{name} {metrics[name]:.3g}" for name in shown if name in metrics)
+    def progress(self, stage: str, done: int, total: int, metrics: Mapping[str, float] | None = None) -> None:
+        note = "  ".join(f"{name} {value:.3g}" for name, value in (metrics or {}).items())
         if self._terminal:
             if stage not in self._tasks:
                 self._tasks[stage] = self._progress.add_task(stage, total=total, note="")

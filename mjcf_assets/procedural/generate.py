@@ -19,6 +19,9 @@ from mjcf_assets.procedural.categories import CATEGORIES
 from mjcf_assets.procedural.partnet_writer import write_object
 from vatmart_jax.atomic_io import write_text
 
+GENERATOR_VERSION = 1
+"""Rises whenever the objects of a seed change: what is cached of them is made again."""
+
 # The order in which categories come: each of them early, and in proportions like those of the real set.
 CYCLE = (
     "StorageFurniture", "Refrigerator", "StorageFurniture", "Table", "Microwave", "StorageFurniture", "Door", "Safe",

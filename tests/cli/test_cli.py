@@ -2,6 +2,8 @@
 
 import json
 import shutil
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -151,25 +153,70 @@ def test_a_damaged_bank_is_refused(tmp_path, capsys):
 def test_an_output_folder_with_another_run_is_refused(tmp_path, capsys):
     run = tmp_path / "run"
     run.mkdir()
-    (run / "config.json").write_text('{"task": "push-door", "seed": 7}')
+    (run / "config.json").write_text('{"format": 2, "task": "push-door", "seed": 7}')
     line = refused(capsys, "train", "--task", "push-door", "--out", str(run))
-    assert "another config" in line and "--out" in line
+    assert "another config" in line and "choose another folder" in line
     assert sorted(p.name for p in run.iterdir()) == ["config.json"]
 
 
 def test_evaluate_refuses_what_is_no_run(tmp_path, capsys):
     assert "no config.json" in refused(capsys, "evaluate", str(tmp_path))
-    assert "--methods magic: not one of ours, random" in refused(
+    assert "--methods magic: not one of ours, priors, random" in refused(
         capsys, "evaluate", str(tmp_path), "--methods", "magic"
     )
 
 
 def test_a_truncated_checkpoint_is_refused(tmp_path, capsys):
     from vatmart_jax.pipeline.presets import PRESETS
-    from vatmart_jax.workflows.train import resolve
+    from vatmart_jax.pipeline.run_config import DataSource, RunConfig
 
+    config = RunConfig(
+        task="push-door", data=DataSource.of(tmp_path), preset="quick", impl="c", seed=0, settings=PRESETS["quick"]
+    )
     run = tmp_path / "run"
     (run / "priors").mkdir(parents=True)
-    (run / "config.json").write_text(json.dumps(resolve("push-door", "quick", "c", 0, PRESETS["quick"], tmp_path)))
+    (run / "config.json").write_text(json.dumps(config.to_json()))
     (run / "priors" / "config.json").write_text("{")
     assert "priors/config.json" in refused(capsys, "evaluate", str(run))
+
+
+@pytest.mark.parametrize(
+    ("flags", "message"),
+    [
+        (("--metrics", "speed"), "--metrics speed: not one of priors, downstream, policy"),
+        (("--impl", "sapien"), "--impl sapien: not one of c, warp, jax"),
+        (("--trials", "0"), "--trials 0: must be at least 1"),
+    ],
+)
+def test_unknown_names_are_refused_with_the_known_ones(flags, message, capsys):
+    assert message in refused(capsys, "evaluate", "push-door", *flags)
+
+
+def test_an_unknown_physics_is_refused_before_anything_is_written(tmp_path, capsys):
+    run = tmp_path / "run"
+    line = refused(capsys, "train", "--task", "push-door", "--impl", "sapien", "--out", str(run))
+    assert "--impl sapien: not one of c, warp, jax" in line and not run.exists()
+
+
+def test_pretrained_sets_of_unknown_objects_want_data(capsys):
+    assert "push-door: was trained on objects that are not part" in refused(capsys, "evaluate", "push-door")
+
+
+def test_a_reader_that_has_seen_enough_is_no_error():
+    command = [sys.executable, "-m", "vatmart_jax.cli", "train", "--help"]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE) as process:
+        assert process.stdout is not None and process.stderr is not None
+        process.stdout.close()
+        assert process.stderr.read() == b""
+
+
+def test_the_help_of_all_commands_imports_nothing_heavy():
+    code = "import sys; from vatmart_jax.cli.main import main\ntry: main(['--help'])\nexcept SystemExit: pass\n"
+    code += "print(sorted({'jax', 'numpy', 'mujoco', 'tyro', 'rich'} & set(sys.modules)))"
+    shown = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
+    assert shown.splitlines()[-1] == "[]"
+
+
+def test_a_plugin_that_cannot_be_loaded_is_one_line(monkeypatch, tmp_path, capsys):
+    monkeypatch.setenv("VATMART_PLUGINS", str(tmp_path / "missing.py"))
+    assert "missing.py" in refused(capsys, "generate", "--out", str(tmp_path / "o"))

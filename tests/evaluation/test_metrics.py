@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from scipy.stats import binomtest
+from scipy.stats import norm
 from sklearn import metrics as sk
 from sklearn.calibration import calibration_curve
 
@@ -15,24 +15,38 @@ from vatmart_jax.evaluation import metrics as m
 def test_scorer_metrics_are_those_of_scikit_learn(seed: int) -> None:
     rng = np.random.default_rng(seed)
     labels, scores = rng.random(200) < 0.3, rng.random(200)
-    said, found = scores > 0.5, m.scorer_metrics(scores, labels)
-    assert found["accuracy"] == pytest.approx(sk.balanced_accuracy_score(labels, said))
-    assert found["precision"] == pytest.approx(sk.precision_score(labels, said))
-    assert found["recall"] == pytest.approx(sk.recall_score(labels, said))
-    assert found["f_score"] == pytest.approx(sk.f1_score(labels, said))
+    predicted, found = scores > 0.5, m.scorer_metrics(scores, labels)
+    assert found["accuracy"] == pytest.approx(sk.balanced_accuracy_score(labels, predicted))
+    assert found["precision"] == pytest.approx(sk.precision_score(labels, predicted))
+    assert found["recall"] == pytest.approx(sk.recall_score(labels, predicted))
+    assert found["f_score"] == pytest.approx(sk.f1_score(labels, predicted))
 
 
-def test_a_scorer_that_says_no_to_all_scores_zero_without_warnings() -> None:
+def test_a_scorer_that_rejects_all_scores_zero_without_warnings() -> None:
     assert m.scorer_metrics(np.zeros(4), np.array([1, 1, 0, 0])) == {
         "accuracy": 0.5, "precision": 0.0, "recall": 0.0, "f_score": 0.0,
     }  # fmt: skip
 
 
+def wilson(successes: int, trials: int, z: float) -> tuple[float, float]:
+    """The closed form (Wilson 1927)."""
+    rate, scale = successes / trials, 1 + z * z / trials
+    half = z * np.sqrt(rate * (1 - rate) / trials + z * z / (4 * trials**2)) / scale
+    centre = (rate + z * z / (2 * trials)) / scale
+    return centre - half, centre + half
+
+
 @given(trials=st.integers(1, 2000), share=st.floats(0, 1), confidence=st.floats(0.5, 0.999))
-def test_wilson_interval_is_that_of_scipy(trials: int, share: float, confidence: float) -> None:
+def test_wilson_interval_is_its_closed_form(trials: int, share: float, confidence: float) -> None:
     k = round(share * trials)
-    expected = binomtest(k, trials).proportion_ci(confidence, method="wilson")
-    np.testing.assert_allclose(m.wilson_interval(k, trials, confidence), (expected.low, expected.high), atol=1e-9)
+    expected = wilson(k, trials, norm.ppf(0.5 + confidence / 2))
+    np.testing.assert_allclose(m.wilson_interval(k, trials, confidence), expected, atol=1e-9)
+
+
+def test_a_reliability_curve_has_its_old_keys_beside_the_new_ones() -> None:
+    found = m.reliability(np.array([0.2, 0.9]), np.array([0, 1])).to_json()
+    assert found["said"] == found["predicted"] and found["happened"] == found["observed"] == [0.0, 1.0]
+    assert found["gap"] == found["calibration_gap"] and found["expected_error"] == found["ece"]
 
 
 def test_without_trials_nothing_is_known() -> None:
@@ -44,18 +58,18 @@ def test_reliability_curve_is_that_of_scikit_learn() -> None:
     scores = rng.random(3000)
     labels = rng.random(3000) < scores**2
     found = m.reliability(scores, labels)
-    happened, said = calibration_curve(labels, scores, n_bins=10)
-    np.testing.assert_allclose(found.happened, happened)
-    np.testing.assert_allclose(found.said, said)
-    assert found.gap == pytest.approx(1 / 2 - 1 / 3, abs=0.02)
-    assert found.expected_error == pytest.approx(1 / 6, abs=0.02)
+    observed, predicted = calibration_curve(labels, scores, n_bins=10)
+    np.testing.assert_allclose(found.observed, observed)
+    np.testing.assert_allclose(found.predicted, predicted)
+    assert found.calibration_gap == pytest.approx(1 / 2 - 1 / 3, abs=0.02)
+    assert found.ece == pytest.approx(1 / 6, abs=0.02)
     assert found.count.sum() == 3000
 
 
 def test_empty_bins_of_a_reliability_curve_are_nan_and_do_not_count() -> None:
     found = m.reliability(np.array([0.05, 1.0]), np.array([0, 1]))
-    assert np.isnan(found.said[1:9]).all()
-    assert found.expected_error == pytest.approx(0.025)
+    assert np.isnan(found.predicted[1:9]).all()
+    assert found.ece == pytest.approx(0.025)
 
 
 def trajectory(**changes) -> np.ndarray:

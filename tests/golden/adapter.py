@@ -20,19 +20,20 @@ from mjcf_assets.procedural.generate import generate
 from vatmart_jax.cli.main import COMMANDS, main
 from vatmart_jax.data.banks import SceneBank, ViewBank
 from vatmart_jax.data.dataset import Data
-from vatmart_jax.envs import TASKS, EnvConfig
+from vatmart_jax.envs import EnvConfig, get_task
 from vatmart_jax.perception.networks import NetworksConfig
 from vatmart_jax.perception.pointnet2 import LocalGroup, PointNet2Config, SetAbstraction
 from vatmart_jax.perception.trainer import PerceptionConfig
 from vatmart_jax.physics import PhysicsConfig
 from vatmart_jax.pipeline.exploration import ExplorationConfig
-from vatmart_jax.pipeline.presets import PRESETS, EvaluationConfig, Schedule, Settings
+from vatmart_jax.pipeline.presets import PRESETS
 from vatmart_jax.pipeline.run_dir import RunDir, read_metrics
+from vatmart_jax.pipeline.settings import EvaluationConfig, Schedule, Settings
 from vatmart_jax.pipeline.trainer import PipelineTrainer
 from vatmart_jax.priors.pretrained import names, run_folder
 from vatmart_jax.priors.priors import Priors
 from vatmart_jax.rl.td3 import TD3Config
-from vatmart_jax.workflows.train import resolve
+from vatmart_jax.workflows.environments import split_environments
 
 RENAMED: dict[str, str] = {
     "flow": "course",
@@ -139,9 +140,9 @@ def tiny_run(banks: tuple[SceneBank, ViewBank], task: str, folder: Path) -> list
     for bank, name in zip(banks, ("scenes", "views"), strict=True):
         bank.save(folder / f"{name}.npz")
     settings = _DOOR if task.endswith("door") else _DRAWER
-    env = Data(folder).env("train", TASKS[task], "c", settings.env, settings.physics)
-    with RunDir(folder / "run", resolve(task, "quick", "c", 0, settings, folder)) as run:
-        PipelineTrainer(run, env, settings, 0, lambda *_: None).train()
+    env = split_environments(Data(folder), get_task(task), "c", settings)[0]["train"]
+    with RunDir(folder / "run", {"task": task}) as run:
+        PipelineTrainer(run, env, settings, seed=0).train()
     rows = [_golden({k: v for k, v in row.items() if k != "seconds"}) for row in read_metrics(folder / "run")]
     return [{**row, "stage": RENAMED.get(row["stage"], row["stage"])} for row in rows]
 

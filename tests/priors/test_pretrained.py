@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from vatmart_jax.errors import UserError
-from vatmart_jax.pipeline.run_config import settings_of
-from vatmart_jax.pipeline.run_dir import read_config
+from vatmart_jax.pipeline.run_config import RunConfig
 from vatmart_jax.priors.pretrained import names, run_folder
 from vatmart_jax.priors.priors import Priors
 
@@ -15,12 +14,11 @@ from vatmart_jax.priors.priors import Priors
 @pytest.mark.parametrize("name", names())
 def test_pretrained_priors_load_by_name_and_predict(name: str) -> None:
     folder = run_folder(Path(name))
-    config = read_config(folder)
-    settings_of(config)
-    assert config["data"] is None
+    config = RunConfig.load(folder)
+    assert config.data.kind == ("bundled" if name.startswith("generated-") else "external")
     assert sum(file.stat().st_size for file in folder.rglob("*")) < 20e6
     priors = Priors.load(folder)
-    assert priors.config.task == config["task"]
+    assert priors.config.task == config.task
     cloud = np.random.default_rng(0).uniform(-0.5, 0.5, (300, 3))
     found = priors.predict(cloud, 0.3, n_proposals=4)
     assert found.trajectories.shape == (4, 30) and np.isfinite(found.trajectories).all()

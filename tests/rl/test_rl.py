@@ -8,8 +8,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from vatmart_jax.envs.observation import relabel
 from vatmart_jax.envs.rewards import reward_terms
-from vatmart_jax.rl.replay_buffer import Episode, ReplayBuffer, Transition, hindsight
+from vatmart_jax.rl.hindsight import Episode, hindsight
+from vatmart_jax.rl.replay_buffer import ReplayBuffer, Transition
 from vatmart_jax.rl.td3 import TD3, TD3Config, TD3State
 
 OBSERVATION, ACTION = 4, 2
@@ -32,7 +34,7 @@ def td3() -> TD3:
 
 @pytest.fixture(scope="module")
 def learn(td3):
-    return jax.jit(td3.learn)
+    return jax.jit(td3.update)
 
 
 @pytest.fixture(scope="module")
@@ -53,7 +55,7 @@ def replay() -> ReplayBuffer:
     last = obs[:, 3]
     action = jax.random.uniform(k2, (CONFIG.buffer_size, ACTION), minval=-1.0)
     reward = last * (10 - 20 * jnp.sum((action - best_action(obs)) ** 2, -1))
-    steps = Transition(obs, action, reward, obs.at[:, 3].set(1), last)
+    steps = Transition(obs=obs, action=action, reward=reward, next_obs=obs.at[:, 3].set(1), done=last)
     return ReplayBuffer.create(CONFIG.buffer_size, OBSERVATION, ACTION).insert(
         steps, jnp.ones(CONFIG.buffer_size, bool)
     )
@@ -72,9 +74,9 @@ def test_td3_finds_the_best_action_and_its_discounted_value(td3, learned):
     assert error.mean() < 0.1
     assert np.isfinite(list(metrics.values())).all()
     # What the best action is worth: 10, and the step before it the discount times that. Scaled.
-    value = td3._values(state.critics, last, best_action(last))
+    value = td3.values(state.critics, last, best_action(last))
     np.testing.assert_allclose(value.mean(1), 1.0, atol=0.15)
-    value = td3._values(state.critics, obs.at[:, 3].set(0), jnp.zeros((500, ACTION)))
+    value = td3.values(state.critics, obs.at[:, 3].set(0), jnp.zeros((500, ACTION)))
     np.testing.assert_allclose(value.mean(1), 0.5, atol=0.15)
 
 
@@ -87,7 +89,7 @@ def saturated(state: TD3State) -> TD3State:
 
 def test_a_saturated_policy_finds_its_way_back_and_without_the_penalty_does_not(td3, learn, fresh, replay):
     last = jax.random.uniform(jax.random.key(3), (500, OBSERVATION), minval=-0.9, maxval=0.9).at[:, 3].set(1)
-    stuck = jax.jit(TD3(replace(CONFIG, pre_tanh_l2=0.0), OBSERVATION, ACTION).learn)
+    stuck = jax.jit(TD3(replace(CONFIG, pre_tanh_l2=0.0), OBSERVATION, ACTION).update)
     error = {}
     for name, step in (("with", learn), ("without", stuck)):
         state = saturated(fresh)
@@ -113,7 +115,7 @@ def test_critics_differ_and_targets_follow_slowly(td3, fresh, replay):
     kernels = [critic["params"]["Dense_0"]["kernel"] for critic in (first, second)]
     assert (kernels[0] != kernels[1]).all()
     steps = replay.sample(jax.random.key(0), CONFIG.batch_size)
-    update = jax.jit(td3._update)
+    update = jax.jit(td3.gradient_step)
     once, _ = update(state, steps, jax.random.key(0))
     same = lambda a, b: all((x == y).all() for x, y in zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True))
     assert same(once.policy, state.policy) and same(once.target_critics, state.target_critics)
@@ -131,13 +133,13 @@ def test_critics_differ_and_targets_follow_slowly(td3, fresh, replay):
 def test_exploration_noise_is_bounded_and_its_random_share_uniform(td3, fresh):
     policy, obs = fresh.policy, jnp.ones((4000, OBSERVATION))
     key = jax.random.key(5)
-    np.testing.assert_array_equal(td3.explore(policy, obs, key, 0.0, 0.0), td3.act(policy, obs))
-    noisy = td3.explore(policy, obs, key, 0.2, 0.0) - td3.act(policy, obs)
+    np.testing.assert_array_equal(td3.explore(policy, obs, key, noise=0.0, random=0.0), td3.act(policy, obs))
+    noisy = td3.explore(policy, obs, key, noise=0.2, random=0.0) - td3.act(policy, obs)
     np.testing.assert_allclose(noisy.std(0), 0.2, rtol=0.1)
-    uniform = td3.explore(policy, obs, key, 0.2, 1.0)
+    uniform = td3.explore(policy, obs, key, noise=0.2, random=1.0)
     assert (np.abs(uniform) <= 1).all()
     np.testing.assert_allclose(uniform.std(0), 1 / np.sqrt(3), rtol=0.1)
-    half = (td3.explore(policy, obs, key, 0.0, 0.5) == td3.act(policy, obs)).all(-1)
+    half = (td3.explore(policy, obs, key, noise=0.0, random=0.5) == td3.act(policy, obs)).all(-1)
     assert 0.45 < half.mean() < 0.55
 
 
@@ -147,7 +149,13 @@ insert = jax.jit(ReplayBuffer.insert)
 
 def numbered(first: int, n: int) -> Transition:
     number = jnp.arange(first, first + n, dtype=jnp.float32)
-    return Transition(number[:, None] + jnp.zeros(3), number[:, None], number, number[:, None] + jnp.ones(3), number)
+    return Transition(
+        obs=number[:, None] + jnp.zeros(3),
+        action=number[:, None],
+        reward=number,
+        next_obs=number[:, None] + jnp.ones(3),
+        done=number,
+    )
 
 
 @settings(deadline=None, max_examples=50)
@@ -202,17 +210,34 @@ def episode() -> Episode:
     done = np.arange(K)[:, None] >= length - 1
     as_f32 = lambda x: jnp.asarray(x, jnp.float32)
     return Episode(
-        as_f32(obs[0]), as_f32(rng.uniform(-1, 1, (K, B, 2))), as_f32(rng.normal(size=(K, B))), as_f32(obs[1]),
-        jnp.asarray(done), jnp.asarray(active), as_f32(before), as_f32(after), as_f32(distance), jnp.asarray(held),
-        as_f32(rng.uniform(0, 50, (K, B))),
-    )  # fmt: skip
+        obs=as_f32(obs[0]),
+        action=as_f32(rng.uniform(-1, 1, (K, B, 2))),
+        reward=as_f32(rng.normal(size=(K, B))),
+        next_obs=as_f32(obs[1]),
+        done=jnp.asarray(done),
+        active=jnp.asarray(active),
+        before=as_f32(before),
+        after=as_f32(after),
+        distance=as_f32(distance),
+        grasp_held=jnp.asarray(held),
+        cost=as_f32(rng.uniform(0, 50, (K, B))),
+    )
 
 
 @pytest.fixture(scope="module")
 def relabelled(episode):
     curiosity = jnp.linspace(0, 500, B)
-    relabel = jax.jit(lambda key: hindsight(episode, key, GOALS, TOLERANCE, reward_terms, curiosity))
-    copies, keep = relabel(jax.random.key(0))
+    copies, keep = jax.jit(
+        lambda key: hindsight(
+            episode,
+            key,
+            goals=GOALS,
+            tolerance=TOLERANCE,
+            reward=reward_terms,
+            relabel=relabel,
+            curiosity=curiosity,
+        )
+    )(jax.random.key(0))
     shaped = jax.tree.map(lambda x: np.asarray(x).reshape(K, B, *x.shape[1:]), copies)
     return shaped, np.asarray(keep).reshape(K, B), np.asarray(curiosity)
 

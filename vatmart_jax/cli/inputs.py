@@ -1,8 +1,7 @@
-"""What commands read: point clouds, masks and goals with their units."""
+"""What commands read: point clouds and masks."""
 
 from __future__ import annotations
 
-import math
 from pathlib import Path
 
 import numpy as np
@@ -45,20 +44,3 @@ def read_mask(path: Path, count: int) -> np.ndarray:
             f"{path}: expected {count} booleans, one of them true at least; found {mask.dtype} {mask.shape}"
         )
     return mask.astype(bool)
-
-
-def parse_goal(text: str, task: str) -> float:
-    """Rad or unit lengths from `30deg`, `0.5rad` or a plain number of the task's unit. Raises UserError."""
-    door = task.endswith("door")
-    number, unit = text, ""
-    for suffix in ("deg", "rad"):
-        if text.endswith(suffix):
-            number, unit = text[: -len(suffix)], suffix
-    try:
-        value = float(number)
-    except ValueError:
-        value = math.nan
-    if not (math.isfinite(value) and value > 0) or (unit and not door):
-        example = "30deg or 0.5rad" if door else "0.3 (unit lengths)"
-        raise UserError(f"--task {text}: expected a goal above 0 such as {example}, for the priors are of {task}")
-    return math.radians(value) if unit == "deg" else value

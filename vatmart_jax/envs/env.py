@@ -67,6 +67,11 @@ class Env:
         return observation_size(self.physics.gripper)
 
     @property
+    def num_views(self) -> int:
+        """Rows of the view table, those that pad it included."""
+        return len(self.view_table.scene)
+
+    @property
     def num_waypoints(self) -> int:
         return WAYPOINTS
 

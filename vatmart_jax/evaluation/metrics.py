@@ -6,25 +6,28 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
-from scipy.special import ndtri
+from scipy.stats import binomtest
 
 COVERAGE_THRESHOLD = 10.0  # the paper's
+ALIASES = {"predicted": "said", "observed": "happened", "calibration_gap": "gap", "ece": "expected_error"}
+"""JSON keys of a reliability curve -> the names that version 0.1 gave them, which stay."""
 
 
 class Reliability(NamedTuple):
-    """What a scorer says against what happens, in K equal bins of the score; empty bins are NaN."""
+    """Predicted against observed success, in K equal bins of the prediction; empty bins are NaN."""
 
-    said: np.ndarray  # [K] mean score
-    happened: np.ndarray  # [K] share of positives
+    predicted: np.ndarray  # [K] mean prediction
+    observed: np.ndarray  # [K] share of positives
     count: np.ndarray  # [K] int
-    gap: float  # |mean score - share of positives|, over all rows
-    expected_error: float  # mean over rows of their bin's |said - happened| (ECE)
+    calibration_gap: float  # |mean prediction - share of positives|, over all rows
+    ece: float  # expected calibration error: mean over rows of their bin's |predicted - observed|
 
     def to_json(self) -> dict[str, Any]:
-        """Its filled bins, and both errors."""
+        """Its filled bins, and both errors; each also by the name that version 0.1 gave it."""
         filled = self.count > 0
-        curve = {name: getattr(self, name)[filled].round(4).tolist() for name in ("said", "happened", "count")}
-        return curve | {"gap": self.gap, "expected_error": self.expected_error}
+        curve = {name: getattr(self, name)[filled].round(4).tolist() for name in ("predicted", "observed", "count")}
+        curve |= {"calibration_gap": self.calibration_gap, "ece": self.ece}
+        return curve | {old: curve[new] for new, old in ALIASES.items()}
 
 
 def scorer_metrics(scores: np.ndarray, labels: np.ndarray, threshold: float = 0.5) -> dict[str, float]:
@@ -32,11 +35,11 @@ def scorer_metrics(scores: np.ndarray, labels: np.ndarray, threshold: float = 0.
 
     scores: [n] probabilities; labels: [n], true or 1 where positive. A ratio without anything below the line is 0.
     """
-    said, true = np.asarray(scores) > threshold, np.asarray(labels).astype(bool)
+    predicted, true = np.asarray(scores) > threshold, np.asarray(labels).astype(bool)
     ratio = lambda a, b: float(a / b) if b else 0.0
-    hits = np.sum(said & true)
-    precision, recall = ratio(hits, said.sum()), ratio(hits, true.sum())
-    rejected = ratio(np.sum(~said & ~true), np.sum(~true))
+    hits = np.sum(predicted & true)
+    precision, recall = ratio(hits, predicted.sum()), ratio(hits, true.sum())
+    rejected = ratio(np.sum(~predicted & ~true), np.sum(~true))
     return {
         "accuracy": (recall + rejected) / 2,
         "precision": precision,
@@ -68,11 +71,8 @@ def wilson_interval(successes: int, trials: int, confidence: float = 0.95) -> tu
     """Wilson's score interval of a success rate; (0, 1) without trials."""
     if trials == 0:
         return 0.0, 1.0
-    z, rate = float(ndtri(0.5 + confidence / 2)), successes / trials
-    scale = 1 + z * z / trials
-    centre = (rate + z * z / (2 * trials)) / scale
-    half = z * np.sqrt(rate * (1 - rate) / trials + z * z / (4 * trials**2)) / scale
-    return max(0.0, float(centre - half)), min(1.0, float(centre + half))
+    found = binomtest(successes, trials).proportion_ci(confidence, method="wilson")
+    return float(found.low), float(found.high)
 
 
 def reliability(scores: np.ndarray, labels: np.ndarray, bins: int = 10) -> Reliability:
@@ -81,11 +81,11 @@ def reliability(scores: np.ndarray, labels: np.ndarray, bins: int = 10) -> Relia
     where = np.minimum((scores * bins).astype(int), bins - 1)
     count = np.bincount(where, minlength=bins)
     total: Any = np.where(count > 0, count, np.nan)
-    said = np.bincount(where, scores, bins) / total
-    happened = np.bincount(where, labels, bins) / total
+    predicted = np.bincount(where, scores, bins) / total
+    observed = np.bincount(where, labels, bins) / total
     n = max(len(scores), 1)
     gap = abs(float(scores.sum() - labels.sum())) / n
-    return Reliability(said, happened, count, gap, float(np.nansum(count * np.abs(said - happened)) / n))
+    return Reliability(predicted, observed, count, gap, float(np.nansum(count * np.abs(predicted - observed)) / n))
 
 
 def _poses(trajectory: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

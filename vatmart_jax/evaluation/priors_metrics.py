@@ -19,7 +19,9 @@ from vatmart_jax.pipeline.proposal_rollouts import interactions_of
 _NOISE = 0.05  # of the policy, share of the action range: varied trajectories, most of them good
 
 
-def labelled(explorer: ExplorationLoop, policy: Any, count: int, key: jax.Array) -> tuple[Interactions, Interactions]:
+def sample_labelled_trajectories(
+    explorer: ExplorationLoop, policy: Any, count: int, key: jax.Array
+) -> tuple[Interactions, Interactions]:
     """`count` positives and as many negatives of the policy, from random starts (paper, section 5.1).
 
     A positive is a trajectory that did its task. Negatives are, half and half where there are enough, positives whose
@@ -32,7 +34,7 @@ def labelled(explorer: ExplorationLoop, policy: Any, count: int, key: jax.Array)
     found = 0
     for batch in range(40):
         final, _ = explorer.rollout(
-            policy, None, jax.random.fold_in(key, batch), _NOISE, 0.0, terminate_on_failure=False
+            policy, None, jax.random.fold_in(key, batch), noise=_NOISE, terminate_on_failure=False
         )
         samples = jax.device_get(interactions_of(final))
         success = np.asarray(samples.success(tolerance))

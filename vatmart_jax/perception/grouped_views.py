@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import zlib
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 
 import jax
@@ -29,6 +30,13 @@ class GroupedViews(PyTreeNode, kw_only=True):
 
     def __len__(self) -> int:
         return len(self.points)
+
+    def padded(self, length: int) -> GroupedViews:
+        """With `length` rows, the last one repeated: views of several environments then share compiled programs."""
+        rows = jnp.minimum(jnp.arange(max(length, len(self))), len(self) - 1)
+        arrays = (self.points, self.contacts, self.prepared, self.joints)
+        points, contacts, prepared, joints = jax.tree.map(lambda x: x[rows], arrays)
+        return replace(self, points=points, contacts=contacts, prepared=prepared, joints=joints)
 
     def check_same_views(self, views: ViewBank) -> None:
         """Raises ValueError unless these are the bank's views: indices into one would mean others in the other."""

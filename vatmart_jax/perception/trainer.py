@@ -70,12 +70,14 @@ def train(
     *,
     stage: str,
     steps: int,
+    limit: int | None = None,
     on_metrics: Callable[[PerceptionState, dict[str, float]], None] = lambda state, metrics: None,
 ) -> PerceptionState:
-    """Train one of STAGES to its end, from the step where `state` stands.
+    """Train one of STAGES to its end, or for `limit` steps, from the step where `state` stands.
 
     `on_metrics` gets the state, which may be saved to resume from, and the mean of every raw loss over the last
-    `log_every` steps. Returns the state with its step back at 0. Raises ValueError where there are no samples.
+    `log_every` steps. At the stage's end the returned state's step is back at 0. Raises ValueError where there are no
+    samples.
     """
     index = index_by_view(samples, len(grouped_views))
     if int(index.total) == 0:
@@ -85,8 +87,9 @@ def train(
     done, program = int(state.step), _program(config)
     if done == 0:  # the moments of the last stage belong to other losses
         state = replace(state, optimizer=_init_optimizer(program, state.params))
-    while done < steps:
-        count = min(config.log_every, steps - done)
+    end = steps if limit is None else min(steps, done + limit)
+    while done < end:
+        count = min(config.log_every, end - done)
         schedule = LearningRateSchedule(
             learning_rate=jnp.float32(config.learning_rate), total=jnp.int32(steps), count=jnp.int32(count)
         )
@@ -95,7 +98,7 @@ def train(
         )
         done += count
         on_metrics(state, {"step": done} | {name: float(value) / count for name, value in sums.items()})
-    return replace(state, step=jnp.int32(0))
+    return replace(state, step=jnp.int32(0)) if done == steps else state
 
 
 @partial(jax.jit, static_argnames=("config", "spec", "stage"))

@@ -1,4 +1,4 @@
-"""The RL stage: a TD3 policy with privileged state learns the task in simulation, one jitted call per iteration."""
+"""The RL stage: a policy with privileged state learns the task in simulation, one jitted call per iteration."""
 
 from __future__ import annotations
 
@@ -12,11 +12,14 @@ import jax.numpy as jnp
 from flax import struct
 
 from vatmart_jax.envs import Env, EnvState, TrialStart
+from vatmart_jax.envs.observation import relabel
 from vatmart_jax.envs.rewards import reward_terms
 from vatmart_jax.envs.scripted_policy import scripted_action
 from vatmart_jax.errors import UserError
-from vatmart_jax.rl.replay_buffer import Episode, ReplayBuffer, hindsight
-from vatmart_jax.rl.td3 import TD3, TD3Config, TD3State
+from vatmart_jax.rl.agent import Agent
+from vatmart_jax.rl.hindsight import Episode, hindsight
+from vatmart_jax.rl.replay_buffer import ReplayBuffer
+from vatmart_jax.rl.td3 import TD3, TD3Config
 from vatmart_jax.trajectory import WAYPOINTS
 
 
@@ -34,7 +37,7 @@ class ExplorationConfig:
     random_action_prob: float = 0.1
     """share of uniformly random actions, decaying as the noise does"""
     warmup_iters: int = 4
-    """iterations before the policy acts: half of the trials take random actions, half are the scripted expert's"""
+    """iterations before the policy acts: half of the trials take random actions, half are the scripted policy's"""
     tracking_penalty: float = 1000.0
     """pulling: penalty per unit length that the hand is from where it was sent, see `Env.tracking_error`; the
     paper has none"""
@@ -42,22 +45,22 @@ class ExplorationConfig:
     """relabelled tasks reach down to this share of the smallest task"""
 
 
-@struct.dataclass
-class ExplorationState:
+class ExplorationState(struct.PyTreeNode, kw_only=True):
     """What the RL stage carries between iterations; a pytree of arrays."""
 
-    td3: TD3State
+    agent: Any  # the state of the agent
     replay: ReplayBuffer
     key: jax.Array
     iteration: jax.Array  # [] int32
 
 
 class ExplorationLoop:
-    """TD3 with hindsight on one environment."""
+    """An agent with hindsight on one environment."""
 
-    def __init__(self, env: Env, config: ExplorationConfig):
+    def __init__(self, env: Env, config: ExplorationConfig, agent: Agent | None = None):
+        """agent: default TD3 as `config` has it."""
         self.env, self.config = env, config
-        self.td3 = TD3(config.td3, env.observation_size, env.action_size)
+        self.agent: Agent = agent or TD3(config.td3, env.observation_size, env.action_size)
         self.train_iteration = jax.jit(self._train_iteration)
         self.rollout = jax.jit(self._rollout, static_argnames="terminate_on_failure")
 
@@ -66,23 +69,24 @@ class ExplorationLoop:
         kt, ks = jax.random.split(key)
         env = self.env
         replay = ReplayBuffer.create(self.config.td3.buffer_size, env.observation_size, env.action_size)
-        return ExplorationState(self.td3.init(kt), replay, ks, jnp.zeros((), jnp.int32))
+        return ExplorationState(agent=self.agent.init(kt), replay=replay, key=ks, iteration=jnp.zeros((), jnp.int32))
 
     def _rollout(
         self,
-        policy,
+        policy: Any,
         pool: TrialStart | None,
         key: jax.Array,
-        noise,
-        random,
-        expert: Any = 0.0,
+        *,
+        noise: jax.Array | float,
+        random: jax.Array | float = 0.0,
+        scripted: jax.Array | float = 0.0,
         terminate_on_failure: bool = True,
     ) -> tuple[EnvState, Episode]:
         """One batch of trials; from the pool if there is one, else from random starts. Consumes the key.
 
-        noise: share of the action range; random: share of uniform actions; expert: share of trials that the scripted
-        expert makes, with the same noise. Without `terminate_on_failure` trials that cannot succeed are acted out too:
-        perception learns from them.
+        noise: share of the action range; random: share of uniform actions; scripted: share of trials that the
+        scripted policy makes, with the same noise. Without `terminate_on_failure` trials that cannot succeed
+        are acted out too: perception learns from them.
         """
         kr, ke = jax.random.split(key)
         begun = self.env.reset(kr, pool)
@@ -91,16 +95,25 @@ class ExplorationLoop:
 
         def step(state: EnvState, key: jax.Array):
             kp, kx = jax.random.split(key)
-            action = self.td3.explore(policy, state.obs, kp, noise, random)
+            action = self.agent.explore(policy, state.obs, kp, noise=noise, random=random)
             shown = scripted_action(self.env, state)
             shown = jnp.clip(shown + noise * jax.random.normal(kx, shown.shape), -1, 1)
-            action = jnp.where(jnp.arange(len(action))[:, None] < expert * len(action), shown, action)
+            action = jnp.where(jnp.arange(len(action))[:, None] < scripted * len(action), shown, action)
             after = self.env.step(state, action, terminate_on_failure=terminate_on_failure)
             cost = self.env.tracking_cost(after, self.config.tracking_penalty)
             record = Episode(
-                state.obs, action, after.reward - cost, after.obs, after.done, ~state.done & ~after.physics.diverged,
-                state.displacement, after.displacement, after.info["tip_distance"], after.grasp_held, cost,
-            )  # fmt: skip
+                obs=state.obs,
+                action=action,
+                reward=after.reward - cost,
+                next_obs=after.obs,
+                done=after.done,
+                active=~state.done & ~after.physics.diverged,
+                before=state.displacement,
+                after=after.displacement,
+                distance=after.info["tip_distance"],
+                grasp_held=after.grasp_held,
+                cost=cost,
+            )
             return after, record
 
         return jax.lax.scan(step, begun, jax.random.split(ke, WAYPOINTS))
@@ -120,16 +133,20 @@ class ExplorationLoop:
         decay = (last / first) ** progress
         warm = state.iteration < config.warmup_iters
         random = jnp.where(warm, 1.0, config.random_action_prob * decay)
-        expert = jnp.where(warm, 0.5, 0.0)
-        final, episode = self._rollout(state.td3.policy, pool, kr, first * decay, random, expert)
+        scripted = jnp.where(warm, 0.5, 0.0)
+        policy = self.agent.acting_params(state.agent)
+        final, episode = self._rollout(policy, pool, kr, noise=first * decay, random=random, scripted=scripted)
         penalty = jnp.zeros_like(final.reward) if curiosity is None else curiosity(final)
         ended = episode.active & episode.done & final.success
         episode = episode.replace(reward=episode.reward - penalty * ended)
         replay = state.replay.insert(*episode.transitions())
         goals = (config.hindsight_low * env.task.goal_range[0], 1.1 * env.task.goal_range[1])
-        reward = partial(reward_terms, config=env.config.reward)
-        replay = replay.insert(*hindsight(episode, kh, goals, env.config.tolerance, reward, penalty))
-        td3, losses = self.td3.learn(state.td3, replay, kl)
+        copies = hindsight(
+            episode, kh, goals=goals, tolerance=env.config.tolerance,
+            reward=partial(reward_terms, config=env.config.reward), relabel=relabel, curiosity=penalty,
+        )  # fmt: skip
+        replay = replay.insert(*copies)
+        agent, losses = self.agent.update(state.agent, replay, kl)
         made = episode.active.sum()
         metrics = {
             "success": final.success.sum() / jnp.maximum(final.valid.sum(), 1),
@@ -141,7 +158,11 @@ class ExplorationLoop:
             "curiosity": (penalty * final.success).sum() / jnp.maximum(final.success.sum(), 1),
             **losses,
         }
-        return ExplorationState(td3, replay, key, state.iteration + 1), final, metrics
+        return (
+            ExplorationState(agent=agent, replay=replay, key=key, iteration=state.iteration + 1),
+            final,
+            metrics,
+        )
 
 
 def start_pool(env: Env, key: jax.Array, size: int, progress: Callable[[int], None] = lambda done: None) -> TrialStart:

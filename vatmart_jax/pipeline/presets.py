@@ -1,76 +1,20 @@
-"""Settings of a training run, and the presets: quick, cpu, gpu, paper. They share one code path."""
+"""The presets quick, cpu, gpu and paper: settings by name. They share one code path."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 
 import jax
 
 from vatmart_jax.envs import EnvConfig
 from vatmart_jax.perception.config import AugmentationConfig, NetworksConfig, PerceptionConfig
 from vatmart_jax.perception.pointnet2 import SMALL
-from vatmart_jax.physics import PhysicsConfig
 from vatmart_jax.pipeline.exploration import ExplorationConfig
+from vatmart_jax.pipeline.settings import EvaluationConfig, Schedule, Settings
 from vatmart_jax.rl.td3 import TD3Config
 
-
-@dataclass(frozen=True)
-class Schedule:
-    """How much of every stage after exploration. Steps are gradient steps of the perception networks."""
-
-    buffer_size: int = 65_536
-    """capacity of the sample buffer; the oldest give way"""
-    late_fraction: float = 0.5
-    """exploration's trials from this share of its iterations on are samples too: policies of several ages"""
-    collect_batches: int = 32
-    """batches of trials by the finished policy from random starts, failures included"""
-    collect_noise: float = 0.05
-    """of the actions then, share of their range"""
-    collect_scripted_fraction: float = 0.25
-    """share of these trials that the scripted expert makes, with the same noise"""
-    flow_steps: int = 300
-    """steps; for networks that have a course"""
-    scorer_steps: int = 100
-    proposal_steps: int = 600
-    actionability_steps: int = 100
-    curiosity_rounds: int = 3
-    """rounds of curiosity: exploration with the penalty, then perception on what it found"""
-    curiosity_iterations: int = 3
-    curiosity_steps: int = 50
-    curiosity_weight: float = 500.0
-    """penalty for a successful trajectory the scorer is sure of; the paper's 500"""
-    finetune_rounds: int = 4
-    """rounds of labelling the networks' own proposals in simulation and training on them jointly"""
-    finetune_batches: int = 12
-    finetune_steps: int = 400
-    finetune_learning_rate: float = 1e-3
-    """learning rate of curiosity and finetune rounds"""
-
-
-@dataclass(frozen=True)
-class EvaluationConfig:
-    """The evaluation at the end of a run."""
-
-    trials: int = 350
-    """per split, as in the paper"""
-    num_proposals: int = 100
-    num_augmentations: int = 8
-    """of a view that the trained networks are asked about, see `TTAPredictor`; goes into the priors' config"""
-
-
-@dataclass(frozen=True)
-class Settings:
-    """Everything that a preset decides."""
-
-    env: EnvConfig = field(default_factory=EnvConfig)
-    physics: PhysicsConfig = field(default_factory=PhysicsConfig)
-    explore: ExplorationConfig = field(default_factory=ExplorationConfig)
-    perception: PerceptionConfig = field(default_factory=PerceptionConfig)
-    schedule: Schedule = field(default_factory=Schedule)
-    evaluation: EvaluationConfig = field(default_factory=EvaluationConfig)
-
-
-# Two cores: small encoders, and few probes of few proposals where the paper has the mean of the best 5 of 100.
+# Two cores: small encoders, and few actionability queries of few proposals where the paper has the mean of the best 5
+# of 100.
 _ON_CPU = PerceptionConfig(
     networks=NetworksConfig(encoder=SMALL, flow_hidden=(128, 128), predict_axis=True, gripper_patch_hidden=(32, 64)),
     actionability_queries=4,
@@ -122,7 +66,7 @@ PRESETS = {
             finetune_steps=3000,
         ),
     ),
-    # The paper's numbers where it gives them (appendix A, B): 5,000 episodes and 5,000 + 5,000 trajectories.
+    # The paper's numbers where it gives them (appendix A, B); docs/paper_vs_this.md has what differs.
     "paper": Settings(
         env=EnvConfig(num_envs=64),
         explore=ExplorationConfig(

@@ -29,8 +29,8 @@ def interactions_of(final: EnvState, trajectory: jax.Array | None = None) -> Int
     )
 
 
-def curious(samples: Interactions, score: jax.Array, tolerance: float) -> Interactions:
-    """The samples that the curiosity stage teaches, the rest emptied (paper, appendix C).
+def select_curious(samples: Interactions, score: jax.Array, tolerance: float) -> Interactions:
+    """The samples that the curiosity stage trains on, the rest emptied (paper, appendix C).
 
     Successes are half surprising (score [B] below 0.5) and half expected ones, failures as many as successes.
     """
@@ -38,10 +38,25 @@ def curious(samples: Interactions, score: jax.Array, tolerance: float) -> Intera
     novel, known, failed = success & (score < 0.5), success & (score >= 0.5), ~success
     known &= jnp.cumsum(known) <= jnp.maximum(novel.sum(), 1)
     failed &= jnp.cumsum(failed) <= jnp.maximum((novel | known).sum(), 1)
-    return samples.replace(view=jnp.where(novel | known | failed, samples.view, -1))
+    return replace(samples, view=jnp.where(novel | known | failed, samples.view, -1))
 
 
 TASKS_PER_VIEW = 8
+
+
+@jax.jit
+def execute_trajectories(env: Env, start: TrialStart, trajectory: jax.Array) -> EnvState:
+    """Whole trials, open loop: trajectories [B, 30] from the contacts of `start`."""
+    rotation, residuals = unpack_trajectory(trajectory)
+    return env.execute(replace(start, rotation=rotation), residuals)
+
+
+@jax.jit
+def _sample_by_view(env: Env, key: jax.Array) -> TrialStart:
+    """A batch of starts in which every TASKS_PER_VIEW in a row share a view. Consumes the key."""
+    kv, kt, ka = jax.random.split(key, 3)
+    view = jnp.repeat(env.sample(kv, max(1, env.config.num_envs // TASKS_PER_VIEW)).view, TASKS_PER_VIEW)
+    return env.sample_approach(ka, view, env.sample_goal(kt, view), env.config.guided_fraction)
 
 
 class ProposalTrials:
@@ -49,21 +64,7 @@ class ProposalTrials:
 
     def __init__(self, env: Env, grouped_views: GroupedViews, predictor: TTAPredictor, proposals: int):
         grouped_views.check_same_views(env.views)
-        self._env, self._grouped_views, self._ensemble, self._proposals = env, grouped_views, predictor, proposals
-        self._execute = jax.jit(self._executed)
-        self._sample_by_view = jax.jit(self._sampled_by_view)
-
-    def _executed(self, start: TrialStart, trajectory: jax.Array) -> EnvState:
-        rotation, residuals = unpack_trajectory(trajectory)
-        return self._env.execute(start.replace(rotation=rotation), residuals)
-
-    def _sampled_by_view(self, key: jax.Array) -> TrialStart:
-        """A batch of starts in which every TASKS_PER_VIEW in a row share a view."""
-        kv, kt, ka = jax.random.split(key, 3)
-        view = jnp.repeat(
-            self._env.sample(kv, max(1, self._env.config.num_envs // TASKS_PER_VIEW)).view, TASKS_PER_VIEW
-        )
-        return self._env.sample_approach(ka, view, self._env.sample_goal(kt, view), self._env.config.guided_fraction)
+        self._env, self._grouped_views, self._predictor, self._proposals = env, grouped_views, predictor, proposals
 
     def best(self, params: Params, start: TrialStart, key: jax.Array) -> tuple[EnvState, jax.Array, jax.Array]:
         """The networks' choice for the views and tasks of `start`: final states, trajectories [B, 30], scores [B].
@@ -71,9 +72,9 @@ class ProposalTrials:
         Consumes the key.
         """
         chosen = select_actions(
-            self._ensemble, params, self._grouped_views, start.view, start.goal, key=key, num_proposals=self._proposals
+            self._predictor, params, self._grouped_views, start.view, start.goal, key=key, num_proposals=self._proposals
         )
-        final = self._execute(replace(start, contact=chosen.contact), chosen.trajectory)
+        final = execute_trajectories(self._env, replace(start, contact=chosen.contact), chosen.trajectory)
         return final, chosen.trajectory, chosen.score
 
     def explore(self, params: Params, key: jax.Array) -> tuple[EnvState, Interactions, jax.Array]:
@@ -82,12 +83,12 @@ class ProposalTrials:
         Returns final states, samples, and which of them [B] bool are the networks' choice. Consumes the key.
         """
         ks, ke = jax.random.split(key)
-        start = self._sample_by_view(ks)
+        start = _sample_by_view(self._env, ks)
         rows = (-1, TASKS_PER_VIEW)
         contact, trajectory = explore_actions(
-            self._ensemble, params, self._grouped_views, start.view.reshape(rows)[:, 0], start.contact.reshape(rows),
+            self._predictor, params, self._grouped_views, start.view.reshape(rows)[:, 0], start.contact.reshape(rows),
             goal=start.goal.reshape(rows), key=ke, num_proposals=self._proposals,
         )  # fmt: skip
         trajectory = trajectory.reshape(len(start.view), -1)
-        final = self._execute(replace(start, contact=contact.reshape(-1)), trajectory)
+        final = execute_trajectories(self._env, replace(start, contact=contact.reshape(-1)), trajectory)
         return final, interactions_of(final, trajectory), jnp.arange(len(trajectory)) % 4 == 0

@@ -4,15 +4,19 @@ from __future__ import annotations
 
 import json
 import time
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import orbax.checkpoint as ocp
+from filelock import FileLock, Timeout
 
 from vatmart_jax.atomic_io import write_json, write_text
 from vatmart_jax.errors import UserError, summarize_error
+
+_LOCK = ".lock"
 
 
 class RunError(UserError):
@@ -20,19 +24,35 @@ class RunError(UserError):
 
 
 class RunDir:
-    """One run folder.
+    """One run folder, which one process at a time may have open. Use as a context manager.
 
     config.json       the resolved config; a folder that holds another one is refused
     metrics.jsonl     one line per unit of work
     checkpoints/      what training carries, the last two states
+    .lock             held while the folder is open
     """
 
-    def __init__(self, folder: Path, config: dict[str, Any]):
-        """Opens or makes the folder. Raises RunError where it holds something else."""
+    def __init__(self, folder: Path, config: Mapping[str, Any]):
+        """Opens or makes the folder. Raises RunError where it holds something else, or another process has it open."""
         self.folder = Path(folder)
         check_folder(self.folder, config)
         self.folder.mkdir(parents=True, exist_ok=True)
-        write_json(self.folder / "config.json", config)
+        self._lock = FileLock(self.folder / _LOCK)
+        try:
+            self._lock.acquire(timeout=0)
+        except Timeout:
+            raise RunError(
+                f"{self.folder}: another process trains in this folder; wait for it, or choose another folder"
+            ) from None
+        try:
+            self._open(config)
+        except BaseException:
+            self._lock.release()
+            raise
+
+    def _open(self, config: Mapping[str, Any]) -> None:
+        check_folder(self.folder, config)  # another process may have made it meanwhile
+        write_json(self.folder / "config.json", dict(config))
         # Orbax writes to a temporary name and renames; async saving would hold device buffers that jit may reuse.
         options = ocp.CheckpointManagerOptions(max_to_keep=2, enable_async_checkpointing=False)
         self._checkpoints = ocp.CheckpointManager((self.folder / "checkpoints").absolute(), options=options)
@@ -55,7 +75,7 @@ class RunDir:
         self._saved_at = time.monotonic()
 
     def restore(self, state: Any) -> Any:
-        """The last checkpointed state, or `state` itself (which says shapes and types) where there is none.
+        """The last checkpointed state, or `state` itself, which gives shapes and types, where there is none.
 
         Metrics logged after that checkpoint are dropped: their work is done again. A damaged checkpoint gives way to
         the one before; RunError where none can be read, and all are left.
@@ -86,6 +106,7 @@ class RunDir:
 
     def __exit__(self, *_: object) -> None:
         self._checkpoints.close()
+        self._lock.release()
 
     def _truncate(self, lines: int) -> None:
         self._lines = lines
@@ -94,28 +115,33 @@ class RunDir:
             write_text(self.metrics, "".join(kept))
 
 
-def check_folder(folder: Path, config: dict[str, Any]) -> None:
+def check_folder(folder: Path, config: Mapping[str, Any]) -> None:
     """Raises RunError where the folder holds something else than a run with this config."""
     path = folder / "config.json"
     if path.exists():
         held = _read_json(path)
+        if "format" in config and "format" not in held and "settings" in held:
+            raise RunError(
+                f"{folder}: holds a run of version {held.get('version')} (format 1), which can be evaluated but not "
+                "resumed here; go on with that version, or choose another folder"
+            )
         changed = sorted(k for k in held.keys() | config.keys() if held.get(k) != config.get(k))
         if changed:
             raise RunError(
                 f"{folder}: holds a run with another config ({', '.join(changed)} differ); "
-                "choose another --out, or delete it"
+                "choose another folder, or delete it"
             )
-    elif folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
-        raise RunError(f"{folder}: is not an empty folder and holds no run (no config.json); choose another --out")
+    elif folder.exists() and (not folder.is_dir() or any(f.name != _LOCK for f in folder.iterdir())):
+        raise RunError(f"{folder}: is not an empty folder and holds no run (no config.json); choose another folder")
 
 
 def _read_json(path: Path) -> dict[str, Any]:
     try:
         value = json.loads(path.read_text())
     except (OSError, ValueError) as e:
-        raise RunError(f"{path}: cannot be read ({e}); choose another --out, or delete the folder") from e
+        raise RunError(f"{path}: cannot be read ({e}); choose another folder, or delete it") from e
     if not isinstance(value, dict):
-        raise RunError(f"{path}: is not a run's config; choose another --out")
+        raise RunError(f"{path}: is not a run's config; choose another folder")
     return value
 
 
@@ -135,7 +161,7 @@ def read_config(folder: Path) -> dict[str, Any]:
     """The resolved config of a run. Raises RunError where there is none."""
     path = Path(folder) / "config.json"
     if not path.is_file():
-        raise RunError(f"{folder}: holds no run (no config.json); give the --out folder of `vatmart train`")
+        raise RunError(f"{folder}: holds no run (no config.json); give the folder that `vatmart train` wrote")
     return _read_json(path)
 
 

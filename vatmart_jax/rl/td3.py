@@ -36,8 +36,7 @@ class TD3Config:
     """gradient steps per batch of trials"""
 
 
-@struct.dataclass
-class TD3State:
+class TD3State(struct.PyTreeNode):
     """Everything that training carries; a pytree of arrays."""
 
     policy: Any
@@ -50,18 +49,20 @@ class TD3State:
 
 
 class TD3:
-    """The learner: functions of TD3State."""
+    """The agent `td3`: functions of TD3State."""
 
-    def __init__(self, config: TD3Config, observation: int, action: int):
-        self.config = config
-        self._policy, self._critic = Policy(config.hidden, action), Critic(config.hidden)
+    name = "td3"
+    config_type = TD3Config
+
+    def __init__(self, config: TD3Config, observation_size: int, action_size: int):
+        self.config, self.observation_size, self.action_size = config, observation_size, action_size
+        self._policy, self._critic = Policy(config.hidden, action_size), Critic(config.hidden)
         self._optimizer = optax.adam(config.learning_rate)
-        self._sizes = (observation, action)
 
     def init(self, key: jax.Array) -> TD3State:
         """Consumes the key."""
         kp, kc = jax.random.split(key)
-        obs, action = (jnp.zeros((1, n)) for n in self._sizes)
+        obs, action = (jnp.zeros((1, n)) for n in (self.observation_size, self.action_size))
         policy = self._policy.init(kp, obs)
         critics = jax.vmap(lambda k: self._critic.init(k, obs, action))(jax.random.split(kc, 2))
         opt = self._optimizer
@@ -71,10 +72,20 @@ class TD3:
         """[B, 33] -> [B, 6] in [-1, 1]."""
         return jnp.tanh(self._raw(policy, obs))
 
+    def acting_params(self, state: TD3State) -> Any:
+        """The policy of the last step."""
+        return state.policy
+
+    def policy_params(self, state: TD3State) -> Any:
+        """The running mean of the policy, which succeeds more often than the last step."""
+        return state.target_policy
+
     def _raw(self, policy: Any, obs: jax.Array) -> jax.Array:
         return self._policy.apply(policy, obs)  # pyright: ignore[reportReturnType]
 
-    def explore(self, policy: Any, obs: jax.Array, key: jax.Array, noise: jax.Array, random: jax.Array) -> jax.Array:
+    def explore(
+        self, policy: Any, obs: jax.Array, key: jax.Array, *, noise: jax.Array | float, random: jax.Array | float
+    ) -> jax.Array:
         """Actions with Gaussian noise (share of the range); a share `random` of them uniform. Consumes the key."""
         kn, ku, kr = jax.random.split(key, 3)
         action = self.act(policy, obs)
@@ -82,33 +93,38 @@ class TD3:
         uniform = jax.random.uniform(ku, action.shape, minval=-1.0)
         return jnp.where(jax.random.uniform(kr, (len(obs), 1)) < random, uniform, action)
 
-    def learn(self, state: TD3State, replay: ReplayBuffer, key: jax.Array) -> tuple[TD3State, dict[str, jax.Array]]:
-        """`updates` gradient steps on the critics, one in `policy_delay` on the policy too. Consumes the key."""
+    def update(self, state: TD3State, replay: ReplayBuffer, key: jax.Array) -> tuple[TD3State, dict[str, jax.Array]]:
+        """`grad_steps_per_iter` gradient steps on the critics, one in `policy_delay` on the policy too. Consumes the
+        key."""
 
-        def update(state, key):
+        def step(state, key):
             ks, kn = jax.random.split(key)
-            return self._update(state, replay.sample(ks, self.config.batch_size), kn)
+            return self.gradient_step(state, replay.sample(ks, self.config.batch_size), kn)
 
-        state, metrics = jax.lax.scan(update, state, jax.random.split(key, self.config.grad_steps_per_iter))
+        state, metrics = jax.lax.scan(step, state, jax.random.split(key, self.config.grad_steps_per_iter))
         return state, jax.tree.map(jnp.mean, metrics)
 
     def _value(self, critic: Any, obs: jax.Array, action: jax.Array) -> jax.Array:
         return self._critic.apply(critic, obs, action)  # pyright: ignore[reportReturnType]
 
-    def _values(self, critics: Any, obs: jax.Array, action: jax.Array) -> jax.Array:
+    def values(self, critics: Any, obs: jax.Array, action: jax.Array) -> jax.Array:
+        """[2, ...] of both critics."""
         value = lambda critic: self._value(critic, obs, action)
         return jax.vmap(value)(critics)
 
-    def _update(self, state: TD3State, steps: Transition, key: jax.Array):
+    def gradient_step(
+        self, state: TD3State, steps: Transition, key: jax.Array
+    ) -> tuple[TD3State, dict[str, jax.Array]]:
+        """One step on the critics and, where its turn is, on the policy. Consumes the key."""
         config = self.config
         noise = jax.random.normal(key, steps.action.shape) * config.target_noise
         noise = jnp.clip(noise, -config.target_noise_clip, config.target_noise_clip)
         next_action = jnp.clip(self.act(state.target_policy, steps.next_obs) + noise, -1, 1)
-        next_value = self._values(state.target_critics, steps.next_obs, next_action).min(0)
+        next_value = self.values(state.target_critics, steps.next_obs, next_action).min(0)
         target = config.reward_scale * steps.reward + config.discount * (1 - steps.done) * next_value
 
         def critic_loss(critics):
-            return jnp.mean((self._values(critics, steps.obs, steps.action) - target) ** 2)
+            return jnp.mean((self.values(critics, steps.obs, steps.action) - target) ** 2)
 
         loss, grads = jax.value_and_grad(critic_loss)(state.critics)
         changes, critic_opt = self._optimizer.update(grads, state.critic_opt)

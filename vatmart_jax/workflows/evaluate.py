@@ -3,67 +3,70 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import jax
 import numpy as np
-from flax import serialization
 
 from vatmart_jax.atomic_io import write_json, write_text
-from vatmart_jax.data.dataset import SPLITS, Data, DataError
-from vatmart_jax.envs import TASKS, Env
-from vatmart_jax.envs.scripted_policy import run_scripted_policy
-from vatmart_jax.errors import UserError, require_one_of, require_positive, summarize_error
+from vatmart_jax.data.dataset import SPLITS, Data
+from vatmart_jax.envs import Env, get_task
+from vatmart_jax.errors import UserError, require_one_of, require_positive
+from vatmart_jax.evaluation.methods.base import METHODS, EvalContext
 from vatmart_jax.evaluation.metrics import wilson_interval
-from vatmart_jax.evaluation.priors_metrics import labelled, priors_metrics
-from vatmart_jax.evaluation.success import Method, downstream, random_method
-from vatmart_jax.perception.grouped_views import group_views
+from vatmart_jax.evaluation.priors_metrics import priors_metrics, sample_labelled_trajectories
+from vatmart_jax.evaluation.success import evaluate_success
+from vatmart_jax.evaluation.tables import evaluation_tables
 from vatmart_jax.physics import BACKENDS
 from vatmart_jax.pipeline.exploration import ExplorationLoop, start_pool
-from vatmart_jax.pipeline.presets import Settings
-from vatmart_jax.pipeline.proposal_rollouts import ProposalTrials
-from vatmart_jax.pipeline.run_config import settings_of
-from vatmart_jax.pipeline.run_dir import read_config
+from vatmart_jax.pipeline.run_config import RunConfig, load_run_policy
 from vatmart_jax.priors.pretrained import run_folder
 from vatmart_jax.priors.priors import Priors
+from vatmart_jax.reporting import NullReporter, Reporter
 from vatmart_jax.viz.plots import reliability_curves
+from vatmart_jax.workflows.environments import split_environments
+from vatmart_jax.workflows.prepare import prepare, prepare_source
 
-METHODS = ("ours", "random", "expert")
 METRICS = ("priors", "downstream", "policy")
-_LABELLED = 350  # positives, and as many negatives (paper, section 5.1)
+NUM_LABELLED = 350  # positives, and as many negatives (paper, section 5.1)
 
-Report = Callable[[str, int, int, dict[str, float]], None]
+
+@dataclass(frozen=True, kw_only=True)
+class EvaluationPlan:
+    """What to evaluate runs with."""
+
+    impl: str  # of the physics
+    metrics: tuple[str, ...] = ("priors", "downstream")  # of METRICS
+    methods: tuple[str, ...] = ("ours", "random")  # of METHODS, downstream
+    trials: int = 350  # per method and split
+    seed: int = 1
+    data: Path | None = None  # instead of what a run was trained on
+
+    def __post_init__(self) -> None:
+        """Raises UserError for what is unknown."""
+        for name in self.metrics:
+            require_one_of("metrics", name, METRICS)
+        for name in self.methods:
+            METHODS.get(name)
+        BACKENDS.require(self.impl)
+        require_positive("trials", self.trials)
 
 
 def evaluate(
-    runs: Sequence[Path],
-    prepared: Callable[[Path | None], Path],
-    data: Path | None,
-    metrics: Sequence[str],
-    methods: Sequence[str],
-    trials: int,
-    impl: str,
-    seed: int,
-    out: Path | None,
-    report: Report,
+    runs: Sequence[Path], plan: EvaluationPlan, *, out: Path | None = None, reporter: Reporter | None = None
 ) -> tuple[dict[str, Any], str]:
     """Evaluate finished runs on test shapes and unseen categories; returns the JSON and a Markdown table.
 
-    runs: folders, or names of pretrained priors. prepared: the converted folder of a --data; data: overrides what a
-    run was trained on. Writes evaluation.json, evaluation.md and reliability.png into `out`, or into each run's folder
-    (nowhere for pretrained ones). Raises UserError for what cannot be evaluated.
+    runs: folders, or names of pretrained priors. Writes evaluation.json, evaluation.md and reliability.png into `out`,
+    or into each run's folder (nowhere for pretrained ones). Raises UserError for what cannot be evaluated.
     """
-    for flag, given, known in (("--metrics", metrics, METRICS), ("--methods", methods, METHODS)):
-        for name in given:
-            require_one_of(flag, name, known)
-    require_one_of("--impl", impl, BACKENDS.names())
-    require_positive("--trials", trials)
     begun = time.monotonic()
     evaluated = []
     for given in runs:
-        result = _evaluate_run(given, prepared, data, metrics, methods, trials, impl, seed, report)
+        result = _evaluate_run(given, plan, reporter or NullReporter())
         evaluated.append(result)
         if out is None and given.is_dir():
             _write(given, {"runs": [result]})
@@ -71,172 +74,116 @@ def evaluate(
     if out is not None:
         out.mkdir(parents=True, exist_ok=True)
         _write(out, everything)
-    return everything, _tables(evaluated)
+    return everything, evaluation_tables(evaluated)
 
 
-def _evaluate_run(given, prepared, data, metrics, methods, trials, impl, seed, report) -> dict[str, Any]:
+def _evaluate_run(given: Path, plan: EvaluationPlan, reporter: Reporter) -> dict[str, Any]:
     folder = run_folder(given)
-    config = read_config(folder)
-    task = TASKS[config["task"]]
+    config = RunConfig.load(folder)
+    settings, task = config.settings, get_task(config.task)
     priors = Priors.load(folder / "priors")
-    settings = settings_of(config, f"{folder}/config.json")
-    converted = Data(prepared(data or (config["data"] and Path(config["data"]))))
-    key = jax.random.key(seed)
-    result: dict[str, Any] = {"run": str(given), "task": task.name, "seed": seed}
-    result |= {"downstream": [], "priors": [], "policy": []}
+    data = _data(given, config, plan, reporter)
+    key = jax.random.key(plan.seed)
+    result: dict[str, Any] = {"run": str(given), "task": task.name, "seed": plan.seed}
+    result |= {"downstream": [], "priors": [], "policy": [], "left_out": {}}
 
-    def environment(split: str) -> Env | None:
-        try:
-            return converted.env(split, task, impl, settings.env, settings.physics)
-        except DataError as e:
-            report(f"{split} left out: {e}", 1, 1, {})
-            return None
-
-    if {"downstream", "priors"} & set(metrics):
+    wanted = [*(SPLITS[1:] if {"downstream", "priors"} & set(plan.metrics) else ())]
+    wanted += [SPLITS[0]] if "policy" in plan.metrics else []
+    envs, result["left_out"] = split_environments(data, task, plan.impl, settings, splits=wanted)
+    for split, reason in result["left_out"].items():
+        reporter.info(f"{split} left out: {reason}")
+    if {"downstream", "priors"} & set(plan.metrics):
         for number, split in enumerate(SPLITS[1:]):
-            if (env := environment(split)) is None:
+            if split not in envs:
                 continue
             kd, kp = jax.random.split(jax.random.fold_in(key, number))
-            if "downstream" in metrics:
-                proposals = settings.evaluation.num_proposals
-                result["downstream"] += evaluate_split(split, env, priors, methods, trials, proposals, kd, report)
-            if "priors" in metrics:
-                scores = _priors_split(folder, env, priors, settings, kp, split, report)
+            context = EvalContext(
+                env=envs[split], priors=priors, num_proposals=settings.evaluation.num_proposals, run_dir=folder
+            )
+            if "downstream" in plan.metrics:
+                result["downstream"] += evaluate_split(
+                    split, context, plan.methods, trials=plan.trials, key=kd, reporter=reporter
+                )
+            if "priors" in plan.metrics:
+                scores = _evaluate_priors(split, context, config, kp, reporter)
                 result["priors"].append({"split": split, **scores})
-    if "policy" in metrics and (env := environment(SPLITS[0])) is not None:
+    if "policy" in plan.metrics and SPLITS[0] in envs:
         _, kp = jax.random.split(jax.random.fold_in(key, len(SPLITS) - 1))
-        result["policy"].append(_evaluate_policy(folder, env, settings, trials, kp, report))
+        result["policy"].append(_evaluate_policy(folder, envs[SPLITS[0]], config, plan.trials, kp, reporter))
     if not any(result[name] for name in METRICS):
-        raise UserError(f"{converted.folder}: has no object to evaluate task {task.name} on; see splits.json")
+        raise UserError(f"{data.folder}: has no object to evaluate task {task.name} on; see splits.json")
     return result
+
+
+def _data(given: Path, config: RunConfig, plan: EvaluationPlan, reporter: Reporter) -> Data:
+    """With as many points as the run's networks read."""
+    num_points = config.settings.perception.networks.encoder.n_points
+    if plan.data is not None:
+        return Data(prepare(plan.data, num_points=num_points, reporter=reporter))
+    folder = prepare_source(config.data, where=str(given), num_points=num_points, reporter=reporter)
+    return Data(folder)
 
 
 def evaluate_split(
     split: str,
-    env: Env,
-    priors: Priors,
+    context: EvalContext,
     methods: Sequence[str],
+    *,
     trials: int,
-    proposals: int,
     key: jax.Array,
-    report: Report,
+    reporter: Reporter | None = None,
 ) -> list[dict[str, Any]]:
-    """One row per method: the same views and tasks for all. Consumes the key."""
+    """One row per method: the same views and goals for all. Consumes the key."""
+    reporter = reporter or NullReporter()
     rows = []
     for name in methods:
-        if name == "ours":
-            grouped_views = group_views(env.views, priors.config.networks.encoder)
-            trial = ProposalTrials(env, grouped_views, priors.predictor, proposals)
-            method = _ours(trial, priors)
-        elif name == "expert":
-            method = lambda start, key: (run_scripted_policy(env, start, key), None)
-        else:
-            method = random_method(env)
         label = f"evaluate {name} on {split}"
-        result = downstream(env, method, trials, key, lambda done, label=label: report(label, done, trials, {}))
-        report(label, trials, trials, {"success": result["success"]})
+        show = lambda done, label=label: reporter.progress(label, done, trials)
+        result = evaluate_success(context.env, METHODS.get(name)(context), trials, key, show)
+        reporter.progress(label, trials, trials, {"success": result["success"]})
         rows.append({"split": split, "method": name, **result})
     return rows
 
 
-def _ours(trial: ProposalTrials, priors: Priors) -> Method:
-    def run(start, key):
-        final, _, score = trial.best(priors.params, start, key)
-        return final, score
-
-    return run
-
-
-def _priors_split(
-    folder: Path, env: Env, priors: Priors, settings: Settings, key: jax.Array, split: str, report: Report
+def _evaluate_priors(
+    split: str, context: EvalContext, config: RunConfig, key: jax.Array, reporter: Reporter
 ) -> dict[str, Any]:
-    explorer = ExplorationLoop(env, settings.explore)
-    policy = load_policy(folder, explorer)
-    kl, km = jax.random.split(key)
-    report(f"label trajectories on {split}", 0, 1, {})
-    positive, negative = labelled(explorer, policy, _LABELLED, kl)
+    priors, folder = context.require_priors(), context.run_dir
+    assert folder is not None
+    agent, policy = load_run_policy(folder)
+    explorer = ExplorationLoop(context.env, config.settings.explore, agent)
+    k_label, k_metrics = jax.random.split(key)
+    reporter.progress(f"label trajectories on {split}", 0, 1)
+    positive, negative = sample_labelled_trajectories(explorer, policy, NUM_LABELLED, k_label)
     if len(positive.view) == 0:
         return {"positives": 0}
-    grouped_views = group_views(env.views, priors.config.networks.encoder)
     result = priors_metrics(
-        priors.predictor,
-        priors.params,
-        grouped_views,
-        positive,
-        negative,
-        km,
-        proposals=settings.evaluation.num_proposals,
-    )
-    report(f"label trajectories on {split}", 1, 1, {})
+        priors.predictor, priors.params, context.views, positive, negative, k_metrics,
+        proposals=context.num_proposals,
+    )  # fmt: skip
+    reporter.progress(f"label trajectories on {split}", 1, 1)
     return result
 
 
-def load_policy(folder: Path, explorer: ExplorationLoop) -> Any:
-    """The parameters of a run's policy. Raises UserError where its file cannot be read."""
-    path = folder / "policy.msgpack"
-    try:
-        return serialization.from_bytes(explorer.init(jax.random.key(0)).td3.policy, path.read_bytes())
-    except (OSError, ValueError, KeyError, TypeError) as e:
-        raise UserError(
-            f"{path}: cannot be read ({summarize_error(e)}); finish the run, or leave out --metrics priors, policy"
-        ) from e
-
-
 def _evaluate_policy(
-    folder: Path, env: Env, settings: Settings, trials: int, key: jax.Array, report: Report
+    folder: Path, env: Env, config: RunConfig, trials: int, key: jax.Array, reporter: Reporter
 ) -> dict[str, Any]:
     """Success of the policy on its training objects: fresh starts that are free and, when pulling, hold.
 
     `env` is of one folder: of a run on several, the others' objects are left out. Trials stop at success, as in the
     paper; a part that is let go is a failure. Consumes the key.
     """
-    explorer = ExplorationLoop(env, settings.explore)
-    policy = load_policy(folder, explorer)
+    agent, policy = load_run_policy(folder)
+    explorer = ExplorationLoop(env, config.settings.explore, agent)
     k_pool, k_run = jax.random.split(key)
-    say = lambda done: report("policy's starts", done, trials, {})
-    pool = start_pool(env, k_pool, trials, say)
+    pool = start_pool(env, k_pool, trials, lambda done: reporter.progress("policy's starts", done, trials))
     wins = []
     for batch in range(-(-trials // env.config.num_envs)):
-        final, _ = explorer.rollout(policy, pool, jax.random.fold_in(k_run, batch), 0.0, 0.0)
+        final, _ = explorer.rollout(policy, pool, jax.random.fold_in(k_run, batch), noise=0.0)
         wins.append(np.asarray(final.success))
     won = np.concatenate(wins)[:trials]
-    interval = [float(x) for x in wilson_interval(int(won.sum()), trials)]
-    return {"split": "train", "success": float(won.mean()), "trials": trials, "ci95": interval}
-
-
-def markdown(rows: Sequence[dict[str, Any]]) -> str:
-    """The table of downstream success, one line per task, method and split. `said` is the mean of its own scores."""
-    lines = [
-        "| task | method | split | success | 95% interval | said | any waypoint | start in collision | trials |",
-        "|---|---|---|---|---|---|---|---|---|",
-    ]
-    for row in rows:
-        low, high = row["ci95"]
-        said = f"{row['said']:.1%}" if "said" in row else "-"
-        lines.append(
-            f"| {row['task']} | {row['method']} | {row['split']} | {row['success']:.1%} | {low:.1%} to {high:.1%} "
-            f"| {said} | {row['success_any_waypoint']:.1%} | {row['in_collision']:.1%} | {row['trials']} |"
-        )
-    return "\n".join(lines)
-
-
-def _tables(runs: Sequence[dict[str, Any]]) -> str:
-    rows = {name: [{"task": run["task"], **row} for run in runs for row in run[name]] for name in METRICS}
-    parts = [markdown(rows["downstream"])] if rows["downstream"] else []
-    scores = [row for row in rows["priors"] if row["positives"]]
-    if scores:
-        names = ("accuracy", "precision", "recall", "f_score", "coverage")
-        lines = [f"| task | split | {' | '.join(names)} |", "|---" * (2 + len(names)) + "|"]
-        for row in scores:
-            lines.append(f"| {row['task']} | {row['split']} | " + " | ".join(f"{row[n]:.1%}" for n in names) + " |")
-        parts.append("\n".join(lines))
-    if rows["policy"]:
-        lines = ["| task | policy's success on training objects | 95% interval | trials |", "|---|---|---|---|"]
-        for row in rows["policy"]:
-            low, high = row["ci95"]
-            lines.append(f"| {row['task']} | {row['success']:.1%} | {low:.1%} to {high:.1%} | {row['trials']} |")
-        parts.append("\n".join(lines))
-    return "\n\n".join(parts)
+    interval = list(wilson_interval(int(won.sum()), trials))
+    return {"split": SPLITS[0], "success": float(won.mean()), "trials": trials, "ci95": interval}
 
 
 def _write(folder: Path, everything: dict[str, Any]) -> None:
@@ -249,4 +196,4 @@ def _write(folder: Path, everything: dict[str, Any]) -> None:
     if curves:
         reliability_curves(curves, folder / "reliability.png")
     write_json(folder / "evaluation.json", everything)
-    write_text(folder / "evaluation.md", _tables(everything["runs"]) + "\n")
+    write_text(folder / "evaluation.md", evaluation_tables(everything["runs"]) + "\n")

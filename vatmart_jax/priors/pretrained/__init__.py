@@ -28,3 +28,8 @@ def run_folder(run: Path) -> Path:
         return FOLDER / str(run)
     known = f", nor pretrained priors ({', '.join(names())})" if names() else ""
     raise UserError(f"{run}: no such run folder{known}; give the --out folder of `vatmart train`")
+
+
+def is_external(folder: Path) -> bool:
+    """Whether a folder is of a pretrained set whose training objects are not in the package."""
+    return folder.resolve().parent == FOLDER.resolve() and not folder.name.startswith("generated-")
