@@ -10,7 +10,7 @@ import jax
 import pytest
 from tiny import TINY
 
-from vatmart_jax.envs import TASKS, make_env
+from vatmart_jax.envs import TASKS, Env, make_env
 from vatmart_jax.pipeline.run_dir import RunDir
 from vatmart_jax.pipeline.trainer import PipelineTrainer
 
@@ -44,5 +44,5 @@ def test_no_program_of_a_whole_run_compiles_twice(env, tmp_path, caplog):
         if record.getMessage().startswith("Compiling ")
     )
     assert compiled
-    twice = {what: n for what, n in compiled.items() if n > (PERCEPTION_STAGES if "_steps" in what else 1)}
+    twice = {what: n for what, n in compiled.items() if n > (PERCEPTION_STAGES if "train_steps" in what else 1)}
     assert not twice
