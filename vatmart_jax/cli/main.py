@@ -16,6 +16,7 @@ from tyro.conf import Positional, arg
 from vatmart_jax import __version__
 from vatmart_jax.atomic_io import atomic_directory, write_json
 from vatmart_jax.errors import OpenGLError, UserError, require_one_of
+from vatmart_jax.host_threads import allow_callbacks
 from vatmart_jax.registry import load_plugins
 
 _Json = Annotated[bool, arg(help="print one JSON object as the last line of standard output")]
@@ -24,6 +25,7 @@ _Json = Annotated[bool, arg(help="print one JSON object as the last line of stan
 def main(argv: list[str] | None = None) -> None:
     """Entry point. Exit codes: 0 done, 2 bad input (one line on standard error), 130 stopped."""
     argv = sys.argv[1:] if argv is None else argv
+    allow_callbacks()
     if argv[:1] == ["--version"]:
         print(__version__)
         return
