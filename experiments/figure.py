@@ -65,8 +65,8 @@ def main(args: Figure) -> None:
             plots.priors_figure(
                 heat, points=points, part_mask=mask, actionability=np.asarray(found.actionability),
                 contact=found.contact, trajectories=np.asarray(found.trajectories[:3]),
-                scores=np.asarray(found.scores[:3]), camera=env.views.camera(view), title=f"{priors.config.task} by {asked}",
-                standoff=env.config.standoff,
+                scores=np.asarray(found.scores[:3]), camera=env.views.camera(view), standoff=env.config.standoff,
+                title=f"{priors.config.task} by {asked}",
             )  # fmt: skip
             animate(recording, film)
             row[0].imshow(plt.imread(heat))

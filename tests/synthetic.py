@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 
-from vatmart_jax.perception.grouped_views import GroupedViews
-from vatmart_jax.perception.pointnet2 import PointNet2Config, group
-from vatmart_jax.perception.trainer import Interactions
+from vatmart_jax.perception.config import TaskSpec
+from vatmart_jax.perception.encoder import EncoderConfig
+from vatmart_jax.perception.grouped_views import GroupedViews, group_points
+from vatmart_jax.perception.interaction_buffer import Interactions
+
+SPEC = TaskSpec(goal_range=(0.1, 0.5), tolerance=0.15, relabel_range=0.45, slides=False)
+"""The task of these boxes. They have one size, and are never scaled."""
 
 
-def boxes(seed: int, views: int, config: PointNet2Config, contacts: int = 32) -> tuple[GroupedViews, np.ndarray]:
+def boxes(seed: int, views: int, config: EncoderConfig, contacts: int = 32) -> tuple[GroupedViews, np.ndarray]:
     """Boxes seen from the front; contacts lie on the front. Returns also the front's inward normals [V, 3]."""
     rng = np.random.default_rng(seed)
     points, touch, normals = [], [], []
@@ -30,9 +33,8 @@ def boxes(seed: int, views: int, config: PointNet2Config, contacts: int = 32) ->
         points.append(rng.permutation(cloud))
         touch.append(face(0, -1, contacts))
         normals.append(turn[:, 0])
-    points, touch = jnp.asarray(np.stack(points), jnp.float16), jnp.asarray(np.stack(touch), jnp.float32)
-    point_groups = jax.jit(jax.vmap(lambda p, c: group(p, c, config)))(points, touch)
-    return GroupedViews(points, point_groups), np.stack(normals)
+    clouds, queries = np.stack(points).astype(np.float16), np.stack(touch).astype(np.float32)
+    return group_points(clouds, queries, config.build()), np.stack(normals)
 
 
 def outcome(
@@ -66,6 +68,11 @@ def samples(seed: int, grouped_views: GroupedViews, normals: np.ndarray, count: 
     trajectory = np.concatenate([up, forward, residuals.reshape(count, -1)], -1).astype(np.float32)
     moved, valid = outcome(grouped_views, normals, view, contact, trajectory)
     return Interactions(
-        jnp.asarray(view, jnp.int32), jnp.asarray(contact, jnp.int32), jnp.asarray(commanded, jnp.float32),
-        jnp.asarray(trajectory), jnp.asarray(moved, jnp.float32), jnp.asarray(valid), jnp.zeros(count, bool),
-    )  # fmt: skip
+        view=jnp.asarray(view, jnp.int32),
+        contact=jnp.asarray(contact, jnp.int32),
+        goal=jnp.asarray(commanded, jnp.float32),
+        trajectory=jnp.asarray(trajectory),
+        displacement=jnp.asarray(moved, jnp.float32),
+        valid=jnp.asarray(valid),
+        from_proposal=jnp.zeros(count, bool),
+    )

@@ -3,15 +3,37 @@
 from __future__ import annotations
 
 import json
-from dataclasses import MISSING, asdict, fields, is_dataclass
-from typing import Any, TypeVar, get_args, get_origin, get_type_hints
+from dataclasses import MISSING, fields, is_dataclass
+from typing import Any, ClassVar, TypeVar, get_args, get_origin, get_type_hints
 
 T = TypeVar("T")
 
 
+class Variant:
+    """Base of the dataclasses of which a field may hold any one; in JSON, `kind` says which."""
+
+    kind: ClassVar[str]
+    default_kind: ClassVar[str]
+    """of JSON without one"""
+
+    @classmethod
+    def of_kind(cls, kind: str) -> type:
+        """The dataclass of this kind. Raises UserError where there is none."""
+        raise NotImplementedError
+
+
 def to_json(config: Any) -> dict[str, Any]:
     """A dataclass as JSON has it: tuples are lists."""
-    return json.loads(json.dumps(asdict(config)))
+    return json.loads(json.dumps(_plain(config)))
+
+
+def _plain(value: Any) -> Any:
+    if is_dataclass(value):
+        kind = {"kind": value.kind} if isinstance(value, Variant) else {}
+        return kind | {f.name: _plain(getattr(value, f.name)) for f in fields(value)}
+    if isinstance(value, dict):
+        return {name: _plain(v) for name, v in value.items()}
+    return [_plain(v) for v in value] if isinstance(value, list | tuple) else value
 
 
 def from_json(kind: type[T], value: Any, where: str = "config") -> T:
@@ -32,6 +54,9 @@ def from_json(kind: type[T], value: Any, where: str = "config") -> T:
 
 
 def _parsed(kind: Any, value: Any, where: str) -> Any:
+    if isinstance(kind, type) and issubclass(kind, Variant) and isinstance(value, dict):
+        value = {"kind": kind.default_kind} | value
+        kind = kind.of_kind(value.pop("kind"))
     if is_dataclass(kind):
         return from_json(kind, value, where)  # pyright: ignore[reportArgumentType]
     if get_origin(kind) is tuple:

@@ -18,7 +18,7 @@ def test_doors_drawers_and_lids_are_known():
     for task in TASKS.values():
         kind = PART_KINDS.get(task.name.split("-")[1])
         assert (kind.joint_type, *kind.goal_range, kind.relabel_range) == pytest.approx(
-            (task.joint_type, task.low, task.high, task.shift)
+            (task.joint_type, *task.goal_range, task.relabel_range)
         )
 
 

@@ -8,16 +8,8 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
-from vatmart_jax.perception.pointnet2 import (
-    LocalGroup,
-    PointNet2,
-    PointNet2Config,
-    SetAbstraction,
-    ball_query,
-    farthest_points,
-    group,
-    three_nearest,
-)
+from vatmart_jax.perception.point_ops import ball_query, farthest_points, three_nearest
+from vatmart_jax.perception.pointnet2 import LocalGroup, PointNet2, PointNet2Config, SetAbstraction, group
 
 TINY = PointNet2Config(
     n_points=200,
@@ -133,5 +125,5 @@ def test_every_parameter_has_a_gradient() -> None:
 def test_levels_and_propagations_must_match() -> None:
     with pytest.raises(ValueError, match="2 levels need as many propagations, not 1"):
         PointNet2Config(levels=TINY.levels, propagation=((16,),))
-    with pytest.raises(ValueError, match="a context needs two levels"):
+    with pytest.raises(ValueError, match="global_context needs two levels"):
         PointNet2Config(levels=TINY.levels[:1], propagation=((16,),), global_context=(8,))

@@ -27,9 +27,9 @@ from vatmart_jax.envs import TASKS, Env, EnvConfig, EnvState, TrialStart, make_e
 from vatmart_jax.envs.scripted_policy import scripted_action
 from vatmart_jax.errors import UserError, require_one_of
 from vatmart_jax.perception import trainer as perception
+from vatmart_jax.perception.config import TaskSpec
 from vatmart_jax.perception.grouped_views import group_views
 from vatmart_jax.perception.networks import Networks
-from vatmart_jax.perception.pointnet2 import group
 from vatmart_jax.physics import BACKENDS
 from vatmart_jax.physics.controller import waypoint_controls
 from vatmart_jax.pipeline.exploration import start_pool
@@ -198,23 +198,24 @@ def bench_perception(choice: Choice, preset: str, seed: int, seconds: float) -> 
     networks, encoder = Networks(config.networks), config.networks.encoder
     rng = np.random.default_rng(seed)
     _, views = choice.banks(seed)
-    views = views.select(rng.permutation(len(views))[: 2 * config.views])
+    views = views.select(rng.permutation(len(views))[: 2 * config.views_per_batch])
     views = replace(views, points=_with_points(rng, views.points, max(10_000, encoder.n_points)))
     upright = jnp.broadcast_to(jnp.array([0.0, 0.0, 1.0]), (len(views), 3))
     grouped_views = group_views(views, encoder).replace(joints=(upright, jnp.zeros((len(views), 3))))
-    rows = 4 * config.views * config.queries
+    spec = TaskSpec(goal_range=(0.1, 0.7), tolerance=0.15, relabel_range=0.45, slides=False)
+    rows = 4 * config.views_per_batch * config.samples_per_view
     samples = perception.Interactions(
         view=jnp.asarray(rng.integers(0, len(views), rows), jnp.int32),
         contact=jnp.asarray(rng.integers(0, views.contacts.shape[1], rows), jnp.int32),
-        goal=jnp.asarray(rng.uniform(config.low, config.high, rows), jnp.float32),
+        goal=jnp.asarray(rng.uniform(*spec.goal_range, rows), jnp.float32),
         trajectory=jnp.asarray(rng.normal(size=(rows, TRAJECTORY)), jnp.float32),
-        displacement=jnp.asarray(rng.uniform(config.low, config.high, rows), jnp.float32),
+        displacement=jnp.asarray(rng.uniform(*spec.goal_range, rows), jnp.float32),
         valid=jnp.ones(rows, bool),
         from_proposal=jnp.zeros(rows, bool),
     )
-    state = perception.begin(jax.random.key(seed), config)
-    steps = partial(perception.train, state, grouped_views, samples, config, steps=config.log_every)
-    trained = [stage for stage in perception.STAGES if stage != "flow" or config.networks.flow_hidden]
+    state = perception.init_state(jax.random.key(seed), config)
+    steps = partial(perception.train, state, grouped_views, samples, config, spec, steps=config.log_every)
+    trained = [stage for stage in perception.STAGES.names() if stage != "flow" or config.networks.flow_hidden]
     stages = {stage: _timed(lambda _, stage=stage: steps(stage=stage), seconds) for stage in trained}
 
     points, queries = (jnp.asarray(x[0], jnp.float32) for x in (views.points[:, :10_000], views.contacts))
@@ -224,8 +225,8 @@ def bench_perception(choice: Choice, preset: str, seed: int, seconds: float) -> 
     return {
         "preset": preset,
         "training_points": encoder.n_points,
-        "views_per_step": config.views,
-        "samples_per_step": config.views * config.queries,
+        "views_per_step": config.views_per_batch,
+        "samples_per_step": config.views_per_batch * config.samples_per_view,
         "parameters": sum(x.size for x in jax.tree.leaves(state.params)),
         "steps_per_second": {name: round(config.log_every / t.seconds, 3) for name, t in stages.items()},
         "encode_points": len(points),
@@ -331,7 +332,7 @@ def _with_points(rng: np.random.Generator, points: np.ndarray, n: int) -> np.nda
     return np.concatenate([points, (near + rng.normal(scale=2e-3, size=near.shape)).astype(points.dtype)], 1)
 
 
-_group = jax.jit(group, static_argnums=2)
+_group = jax.jit(lambda points, queries, config: config.build().prepare(points, queries), static_argnums=2)
 
 
 def _share(flags: Any) -> float:

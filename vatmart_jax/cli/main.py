@@ -355,15 +355,16 @@ def _predict(argv: list[str]) -> None:
 
     args = tyro.cli(Predict, args=argv, prog="vatmart predict")
     _enable_compilation_cache()
+    from vatmart_jax.cli.inputs import parse_goal, read_cloud, read_mask
     from vatmart_jax.priors.pretrained import run_folder
-    from vatmart_jax.priors.priors import Priors, amount, read_cloud, read_mask
+    from vatmart_jax.priors.priors import Priors
 
     priors = Priors.load(run_folder(args.priors))
     points = read_cloud(args.cloud)
     mask = None if args.mask is None else read_mask(args.mask, len(points))
     import jax
 
-    key, task = jax.random.key(args.seed), amount(args.task, priors.config.task)
+    key, task = jax.random.key(args.seed), parse_goal(args.task, priors.config.task)
     found = priors.predict(points, task, mask, key, args.proposals)
     if args.out is not None:
         found.save(args.out)

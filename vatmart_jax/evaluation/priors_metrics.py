@@ -10,9 +10,9 @@ import numpy as np
 
 from vatmart_jax.evaluation import metrics as m
 from vatmart_jax.perception.grouped_views import GroupedViews
-from vatmart_jax.perception.networks import Params
-from vatmart_jax.perception.predictor import TTAPredictor, propose_trajectories, score_trajectories
-from vatmart_jax.perception.trainer import Interactions
+from vatmart_jax.perception.interaction_buffer import Interactions
+from vatmart_jax.perception.layers import Params
+from vatmart_jax.perception.predictor import TTAPredictor, encode_contacts, propose_from, score_trajectories
 from vatmart_jax.pipeline.exploration import ExplorationLoop
 from vatmart_jax.pipeline.proposal_rollouts import interactions_of
 
@@ -70,17 +70,18 @@ def priors_metrics(
     Coverage is the mean of `runs` draws of `proposals` trajectories per positive. Consumes the key.
     """
     score = lambda s: np.asarray(
-        score_trajectories(predictor, params, grouped_views, s.view, s.contact, s.goal, s.trajectory)
+        score_trajectories(predictor, params, grouped_views, s.view, s.contact, goal=s.goal, trajectory=s.trajectory)
     )
     p, n = score(positive), score(negative)
     labels = np.concatenate([np.ones(len(p)), np.zeros(len(n))])
     scores = np.concatenate([p, n])
     result = {**m.scorer_metrics(scores, labels), "reliability": m.reliability(scores, labels).to_json()}
     covered = []
+    proposer = TTAPredictor(predictor.networks)  # proposals are made for the view as it is
+    encoded = encode_contacts(proposer, params, grouped_views, positive.view, positive.contact)
     for run in range(runs):
-        proposed, _ = propose_trajectories(
-            predictor, params, grouped_views, positive.view, positive.contact, positive.goal,
-            jax.random.fold_in(key, run), proposals,
-        )  # fmt: skip
+        proposed = propose_from(
+            proposer, params, encoded, positive.goal, key=jax.random.fold_in(key, run), num_proposals=proposals
+        )
         covered.append(m.coverage(np.asarray(proposed), np.asarray(positive.trajectory)))
     return {**result, "coverage": float(np.mean(covered)), "positives": len(p), "negatives": len(n)}

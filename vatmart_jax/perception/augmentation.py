@@ -1,7 +1,8 @@
 """A scene mirrored left to right, turned about the vertical and scaled, with all that happens in it.
 
 Mirrored and turned scenes are exact: the gripper is its own mirror image. A scaled one takes the gripper's size along,
-which is small beside it. Training augments with them; at inference the networks are asked about several.
+which is small beside it. Training augments with them; at inference predictions are averaged over several (test-time
+augmentation).
 """
 
 from __future__ import annotations
@@ -30,34 +31,34 @@ class SceneTransform(NamedTuple):
 
     def directions(self, v: jax.Array) -> jax.Array:
         """Vectors [..., 3] mirrored and turned, of the same length."""
-        return jnp.where(self.mirrored, v * _MIRROR, v) @ self._turn
+        return jnp.where(self.mirrored, v * _MIRROR, v) @ self._rotation
 
     def points(self, p: jax.Array) -> jax.Array:
         """Points [..., 3]."""
         return self.directions(p) * self.scale
 
     def trajectory(self, trajectory: jax.Array) -> jax.Array:
-        """Trajectories [..., 30], see geometry.pack_trajectory."""
+        """Trajectories [..., 30], see trajectory.pack_trajectory."""
         trajectory = jnp.where(self.mirrored, trajectory * _MIRROR_TRAJECTORY, trajectory)
         triples = trajectory.reshape(*trajectory.shape[:-1], -1, 3)
         number = jnp.arange(triples.shape[-2])[:, None]  # two of the start rotation, then a move and Euler angles
         is_euler, is_move = (number >= 3) & (number % 2 == 1), (number >= 2) & (number % 2 == 0)
-        triples = jnp.where(is_euler, triples, triples @ self._turn) * jnp.where(is_move, self.scale, 1.0)
+        triples = jnp.where(is_euler, triples, triples @ self._rotation) * jnp.where(is_move, self.scale, 1.0)
         return triples.reshape(trajectory.shape)
 
-    def task(self, task: jax.Array, is_length: bool) -> jax.Array:
-        """Amounts [...]: angles stay, lengths (drawers) grow with the scene."""
-        return task * self.scale if is_length else task
+    def goal(self, goal: jax.Array, slides: bool) -> jax.Array:
+        """Goals [...]: angles stay, the lengths of slides grow with the scene."""
+        return goal * self.scale if slides else goal
 
     @property
-    def _turn(self) -> jax.Array:
+    def _rotation(self) -> jax.Array:
         cos, sin, zero = jnp.cos(self.yaw), jnp.sin(self.yaw), jnp.zeros_like(self.yaw)
         return jnp.array([[cos, sin, zero], [-sin, cos, zero], [zero, zero, zero + 1]])  # of row vectors
 
 
 def tta_transforms(count: int, yaw: float = 0.2) -> SceneTransform:
-    """`count` exact transforms [count] to ask the networks about: the scene as it is, then mirrored by turns, turned
-    by up to `yaw` (rad), which training augments with too."""
+    """`count` exact transforms [count] for test-time augmentation: the identity first, then every other one mirrored,
+    turned by up to `yaw` (rad), within what training augments with."""
     number = np.arange(count)
     turned = yaw * np.sin(2.4 * number)  # 2.4 rad: no two of a few are alike
     return SceneTransform(jnp.asarray(number % 2 == 1), jnp.asarray(turned, jnp.float32), jnp.ones(count))

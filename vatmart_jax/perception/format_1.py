@@ -13,6 +13,7 @@ _NETWORKS = {
     "posterior": "posterior_hidden", "decoder": "decoder_hidden", "scorer": "scorer_hidden",
     "actionability": "actionability_hidden",
 }  # fmt: skip
+_AUGMENTATION = ("yaw", "mirror", "scale")
 _PARAMETERS = {"course": "flow"}
 
 
@@ -28,6 +29,12 @@ def networks_config(config: Mapping[str, Any]) -> dict[str, Any]:
     for groups in ("levels", "local_groups"):
         encoder[groups] = [renamed(level, _LEVEL) for level in encoder[groups]]
     return out | {"encoder": encoder}
+
+
+def grouped_augmentation(config: Mapping[str, Any]) -> dict[str, Any]:
+    """A PerceptionConfig whose fields of augmentation lay beside the others, with these in `augmentation`."""
+    own = {name: value for name, value in config.items() if name in _AUGMENTATION}
+    return {name: value for name, value in config.items() if name not in own} | {"augmentation": own}
 
 
 def parameters(tree: Any) -> Any:

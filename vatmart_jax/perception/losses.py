@@ -1,4 +1,4 @@
-"""Losses of the three heads (paper, 4.2). Every term is a mean over rows, weighted where some rows do not count."""
+"""Losses of the three heads (paper, 4.2). Every term is a mean over rows, weighted where some rows are left out."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from vatmart_jax.trajectory import cumulative_residuals
 
 
 def score_loss(logits: jax.Array, labels: jax.Array) -> jax.Array:
-    """Binary cross-entropy of logits and labels (0 or 1), both [...], the two classes weighing the same."""
+    """Binary cross-entropy of logits and labels (0 or 1), both [...], with both classes of equal weight."""
     share = jnp.clip(labels.mean(), 0.05, 0.95)
     weights = jnp.where(labels > 0.5, 0.5 / share, 0.5 / (1 - share))
     return jnp.mean(optax.sigmoid_binary_cross_entropy(logits, labels) * weights)

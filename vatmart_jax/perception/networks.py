@@ -1,4 +1,4 @@
-"""The perception networks: encoders of view, contact, task and trajectory, and the three heads (paper, 4.2 and B).
+"""The perception networks: encoders of view, contact, goal and trajectory, and the heads (paper, 4.2 and B).
 
 Layer sizes are the paper's. It leaves the activations open, and the released code leaves out most of them (its
 decoder is affine in z); here every hidden layer of a head or of the trajectory encoder is followed by a leaky ReLU,
@@ -7,6 +7,7 @@ and the paper's single fully connected layers (contact, task) are linear.
 
 from __future__ import annotations
 
+import zlib
 from dataclasses import dataclass, field
 from functools import partial
 from typing import NamedTuple
@@ -15,64 +16,19 @@ import flax.linen as nn
 import jax
 import jax.numpy as jnp
 
-from vatmart_jax.perception.pointnet2 import PointGroups, PointNet2, PointNet2Config, SharedMLP, local_offsets
-from vatmart_jax.rotations import apply_joint_motion, matrix_from_rot6d, normalize, rot6d_from_matrix
-from vatmart_jax.trajectory import TRAJECTORY, WAYPOINTS, cumulative_residuals
-
-Params = dict  # of the networks' names to their Flax parameters
-
-# What enters a network is brought to the order of 1: residual moves are 0.05 to 0.3 unit lengths, Euler residuals
-# 0.1 to 0.5 rad, tasks 0.1 to 1.2 (rad or unit lengths), contacts already -1 to 1. The decoder's output is scaled back.
-TASK_SCALE = 3.0
-MOVE_SCALE = 5.0
-TURN_SCALE = 2.0
-HAND_SCALE = 10.0  # of where points around the contact are, within 0.15 unit lengths of it in the presets
-FLOW = 3 * WAYPOINTS + 3
-AXIS_AND_ARM = 6
-SCALE = (1.0,) * 6 + ((MOVE_SCALE,) * 3 + (TURN_SCALE,) * 3) * WAYPOINTS  # of the 30 numbers of a trajectory
-
-
-@dataclass(frozen=True)
-class NetworksConfig:
-    """Sizes of the networks; the defaults are the paper's."""
-
-    encoder: PointNet2Config = field(default_factory=PointNet2Config)
-    separate_encoders: bool = False
-    """One point cloud encoder for each head, as in the released code, instead of one for all three."""
-    contact_dim: int = 32
-    """Width of the contact point's feature."""
-    task_dim: int = 32
-    """Width of the task's feature."""
-    absolute_waypoints: bool = True
-    """The trajectory encoder also reads where the fingertips are sent: residuals summed up. The paper's does not."""
-    trajectory_hidden: tuple[int, ...] = (128, 128, 128)
-    """Widths of the trajectory encoder."""
-    latent_dim: int = 128
-    """Dimensions of the cVAE's Gaussian."""
-    posterior_hidden: tuple[int, ...] = (128, 128)
-    """Hidden widths of the cVAE's encoder."""
-    decoder_hidden: tuple[int, ...] = (512, 256)
-    """Hidden widths of the cVAE's decoder."""
-    scorer_hidden: tuple[int, ...] = (128,)
-    """Hidden widths of the trajectory scoring head."""
-    actionability_hidden: tuple[int, ...] = (128, 128, 128, 128)
-    """Hidden widths of the actionability head."""
-    flow_hidden: tuple[int, ...] = ()
-    """Hidden widths of a head that tells where the touched point goes when the task is done; the others read what it
-    says. Without it, as in the paper, they find out for themselves."""
-    predict_axis: bool = False
-    """The course of a door is an arc: its head tells where the hinge is, the rest is geometry. Drawers have none."""
-    gripper_patch_hidden: tuple[int, ...] = ()
-    """Widths of a network over the points around the contact as the hand at the start sees them, which the scorer
-    reads: what the fingers would close on or run into. The paper has none."""
-
-    def __post_init__(self) -> None:
-        if self.flow_hidden and self.separate_encoders:
-            raise ValueError("a course needs the shared encoder: leave out one of `flow` and `separate`")
-        if self.predict_axis and not self.flow_hidden:
-            raise ValueError("a hinge is told by the course's head: give `flow` its widths, or leave out `hinge`")
-        if self.gripper_patch_hidden and not self.encoder.local_groups:
-            raise ValueError("the hand sees the groups of `encoder.local_groups`: give it some, or leave out `hand`")
+from vatmart_jax.perception.articulation_flow import (
+    AXIS_AND_ARM,
+    FLOW,
+    POSITION_SCALE,
+    articulation_flow,
+    unpack_flow,
+)
+from vatmart_jax.perception.config import NetworksConfig
+from vatmart_jax.perception.encoder import PointEncoder, Prepared
+from vatmart_jax.perception.heads import HEADS, TRAJECTORY_SCALE, Head, TrajectoryHead
+from vatmart_jax.perception.layers import Params, apply, flatten_last_two, init
+from vatmart_jax.rotations import matrix_from_rot6d, normalize, rot6d_from_matrix
+from vatmart_jax.trajectory import TRAJECTORY
 
 
 class Features(NamedTuple):
@@ -81,52 +37,45 @@ class Features(NamedTuple):
     scorer: jax.Array  # [Q, feature_dim]
     proposal: jax.Array  # [Q, feature_dim]
     actionability: jax.Array  # [Q, feature_dim]
-    local_groups: jax.Array  # [Q, 3 K] from the query to the points around it, K of them where the networks have `hand`
+    local_offsets: jax.Array  # [Q, 3 K] from the query to the points around it; K = 0 without a gripper patch
 
 
 @dataclass(frozen=True)
 class Networks:
     """The networks as functions of their parameters.
 
-    Heads broadcast: features [..., F], contact [..., 3], task [...], trajectory [..., 30] and z [..., latent] may
+    Heads broadcast: features [..., F], contact [..., 3], goal [...], trajectory [..., 30] and z [..., latent] may
     have any leading dimensions that broadcast against each other. What is shared is computed once: P proposals at Q
     points take features [Q, 1, F] and z [P, latent].
     """
 
     config: NetworksConfig = field(default_factory=NetworksConfig)
 
+    @property
+    def encoder(self) -> PointEncoder:
+        """The point cloud encoder, one for all heads or of each of them."""
+        return self.config.encoder.build()
+
     @partial(jax.jit, static_argnums=0)
     def init(self, key: jax.Array) -> Params:
         """Consumes the key. Returns a plain dict with one entry per network."""
-        encoder = self.config.encoder
-        n = encoder.levels[0].num_centroids
-        sizes = [n, *(level.num_centroids for level in encoder.levels)]
-        index = lambda *shape: jnp.zeros(shape, jnp.int16)
-        point_groups = PointGroups(
-            jnp.zeros((1, 3)),
-            tuple(index(m) for m in sizes[1:]),
-            tuple(index(m, level.max_neighbors) for m, level in zip(sizes[1:], encoder.levels, strict=True)),
-            tuple(index(t, 3) for t in (1, *sizes[1:-1])),
-            tuple(jnp.zeros((t, 3), jnp.float16) for t in (1, *sizes[1:-1])),
-            tuple(index(1, local_groups.max_neighbors) for local_groups in encoder.local_groups),
-        )
-        f, contact, task = jnp.zeros(encoder.feature_dim), jnp.zeros(3), jnp.zeros(())
+        f, contact, goal = jnp.zeros(self.encoder.feature_dim), jnp.zeros(3), jnp.zeros(())
         trajectory, z = jnp.zeros(TRAJECTORY), jnp.zeros(self.config.latent_dim)
-        keys = iter(jax.random.split(key, 8))
-        params = {
-            name: PointNet2(encoder).init(next(keys), jnp.zeros((n, 3)), point_groups)["params"]
-            for name in self.encoders("scorer", "proposal", "actionability")
-        }
         flow = (jnp.zeros(FLOW),) if self.config.flow_hidden else ()
-        local_groups = jnp.zeros(3) if self.config.gripper_patch_hidden else None
-        params["scorer"] = self._scorer.init(
-            next(keys), trajectory, f, contact, task, *flow, local_groups=local_groups
-        )["params"]
-        params["posterior"] = self._posterior.init(next(keys), trajectory, f, contact, task, *flow)["params"]
-        params["decoder"] = self._decoder.init(next(keys), f, contact, task, *flow, z)["params"]
-        params["actionability"] = self._actionability.init(next(keys), f, contact, task, *flow)["params"]
+        local_offsets = jnp.zeros(3) if self.config.gripper_patch_hidden else None
+        keys = iter(jax.random.split(key, 8))
+        params = {name: self.encoder.init(next(keys)) for name in self.encoders("scorer", "proposal", "actionability")}
+        params["scorer"] = init(
+            self._scorer, next(keys), trajectory, f, contact, goal, *flow, local_offsets=local_offsets
+        )
+        params["posterior"] = init(self._posterior, next(keys), trajectory, f, contact, goal, *flow)
+        params["decoder"] = init(self._decoder, next(keys), f, contact, goal, *flow, z)
+        params["actionability"] = init(self._actionability, next(keys), f, contact, goal, *flow)
         if self.config.flow_hidden:
-            params["flow"] = self._flow.init(next(keys), f, contact, task)["params"]
+            params["flow"] = init(self._flow, next(keys), f, contact, goal)
+        for name in self.config.extra_heads:
+            own = jax.random.fold_in(key, zlib.crc32(name.encode()))
+            params[name] = init(self._extra(name), own, trajectory, f, contact, goal)
         return params
 
     def encoders(self, *heads: str) -> tuple[str, ...]:
@@ -134,99 +83,103 @@ class Networks:
         return tuple(f"{head}_encoder" for head in heads) if self.config.separate_encoders else ("encoder",)
 
     def features(
-        self, params: Params, points: jax.Array, point_groups: PointGroups, which: jax.Array | None = None
+        self, params: Params, points: jax.Array, prepared: Prepared, query_index: jax.Array | None = None
     ) -> Features:
-        """Encodes one view: points [N, 3], which [Q] int into the grouping's queries (None for all).
+        """Encodes one view: points [N, 3], query_index [Q] int into the queries it was prepared with (None for all).
 
         vmap it over views. What no head reads afterwards is not computed under jit.
         """
-        encode = lambda name: PointNet2(self.config.encoder).apply(
-            {"params": params[name]}, points, point_groups, which
-        )
-        found = [encode(name) for name in self.encoders("scorer", "proposal", "actionability")]
-        local_groups = jnp.zeros((len(found[0]), 0))
+        names = self.encoders("scorer", "proposal", "actionability")
+        found = [self.encoder.apply(params[name], points, prepared, query_index) for name in names]
+        scorer, proposal, actionability = found if self.config.separate_encoders else found * 3
+        offsets = jnp.zeros((len(scorer), 0))
         if self.config.gripper_patch_hidden:
-            local_groups = jnp.concatenate(local_offsets(points, point_groups, which), -2).reshape(
-                len(local_groups), -1
-            )
-        return Features(*(found if self.config.separate_encoders else found * 3), local_groups)  # pyright: ignore[reportArgumentType, reportCallIssue]
+            offsets = flatten_last_two(self.encoder.local_offsets(points, prepared, query_index))
+        return Features(scorer, proposal, actionability, offsets)
 
     def score(
         self,
         params: Params,
         f: Features,
         contact: jax.Array,
-        task: jax.Array,
+        goal: jax.Array,
         trajectory: jax.Array,
+        *,
         flow: jax.Array | None = None,
     ) -> jax.Array:
-        """Logit [...] that the trajectory does the task; trajectories as `geometry.pack_trajectory` makes them.
+        """Logit [...] that the trajectory reaches the goal; trajectories as `trajectory.pack_trajectory` makes them.
 
-        course: [..., 15], read in place of what the networks themselves say of it.
+        flow: [..., 15], read in place of the networks' own prediction.
         """
-        at = self._at(params, f, f.scorer, contact, task, flow)
-        local_groups = f.local_groups if self.config.gripper_patch_hidden else None
-        return self._scorer.apply({"params": params["scorer"]}, trajectory, *at, local_groups=local_groups)[..., 0]  # pyright: ignore
+        inputs = self._inputs(params, f, f.scorer, contact, goal, flow=flow)
+        local_offsets = f.local_offsets if self.config.gripper_patch_hidden else None
+        return apply(self._scorer, params["scorer"], trajectory, *inputs, local_offsets=local_offsets)[..., 0]
 
     def posterior(
-        self, params: Params, f: Features, contact: jax.Array, task: jax.Array, trajectory: jax.Array
+        self, params: Params, f: Features, contact: jax.Array, goal: jax.Array, trajectory: jax.Array
     ) -> tuple[jax.Array, jax.Array]:
         """Mean and log variance [..., latent] of the cVAE's encoder."""
-        at = self._at(params, f, f.proposal, contact, task)
-        out = self._posterior.apply({"params": params["posterior"]}, trajectory, *at)
-        return tuple(jnp.split(out, 2, -1))  # pyright: ignore
+        inputs = self._inputs(params, f, f.proposal, contact, goal)
+        mean, log_variance = jnp.split(apply(self._posterior, params["posterior"], trajectory, *inputs), 2, -1)
+        return mean, log_variance
 
-    def decode(self, params: Params, f: Features, contact: jax.Array, task: jax.Array, z: jax.Array) -> jax.Array:
+    def decode(self, params: Params, f: Features, contact: jax.Array, goal: jax.Array, z: jax.Array) -> jax.Array:
         """The decoder's raw output [..., 30]: as `propose`, the first six numbers not orthonormal."""
-        at = self._at(params, f, f.proposal, contact, task)
-        out: jax.Array = self._decoder.apply({"params": params["decoder"]}, *at, z) / jnp.array(SCALE)  # pyright: ignore
-        if self.config.flow_hidden:  # then the decoder says how the hand departs from it
-            places, _ = unpack_flow(at[-1])
-            steps = jnp.diff(places, axis=-2, prepend=0.0)
-            steps = _flat(jnp.concatenate([steps, jnp.zeros_like(steps)], -1))
+        inputs = self._inputs(params, f, f.proposal, contact, goal)
+        out = apply(self._decoder, params["decoder"], *inputs, z) / jnp.array(TRAJECTORY_SCALE)
+        if self.config.flow_hidden:  # then the decoder's output is the hand's departure from it
+            displacements, _ = unpack_flow(inputs[-1])
+            steps = jnp.diff(displacements, axis=-2, prepend=0.0)
+            steps = flatten_last_two(jnp.concatenate([steps, jnp.zeros_like(steps)], -1))
             out = out + jnp.concatenate([jnp.zeros_like(steps[..., :6]), steps], -1)
         return out
 
-    def propose(self, params: Params, f: Features, contact: jax.Array, task: jax.Array, z: jax.Array) -> jax.Array:
+    def propose(self, params: Params, f: Features, contact: jax.Array, goal: jax.Array, z: jax.Array) -> jax.Array:
         """Trajectories [..., 30] for z [..., latent] drawn from a standard normal distribution."""
-        raw = self.decode(params, f, contact, task, z)
+        raw = self.decode(params, f, contact, goal, z)
         return jnp.concatenate([rot6d_from_matrix(matrix_from_rot6d(raw[..., :6])), raw[..., 6:]], -1)
 
-    def actionability(self, params: Params, f: Features, contact: jax.Array, task: jax.Array) -> jax.Array:
+    def actionability(self, params: Params, f: Features, contact: jax.Array, goal: jax.Array) -> jax.Array:
         """Logit [...] of the actionability score."""
-        at = self._at(params, f, f.actionability, contact, task)
-        return self._actionability.apply({"params": params["actionability"]}, *at)[..., 0]  # pyright: ignore
+        inputs = self._inputs(params, f, f.actionability, contact, goal)
+        return apply(self._actionability, params["actionability"], *inputs)[..., 0]
 
-    def flow(self, params: Params, f: Features, contact: jax.Array, task: jax.Array) -> jax.Array:
-        """[..., 15] what becomes of a point of the part while the task is done: where it is after each quarter,
-        relative to the contact, and the rotation vector of the part at the end; scaled (see `unpack_flow`)."""
+    def flow(self, params: Params, f: Features, contact: jax.Array, goal: jax.Array) -> jax.Array:
+        """[..., 15] the predicted articulation flow of the contact under the goal, see `articulation_flow`."""
         if not self.config.predict_axis:
-            return self._flow.apply({"params": params["flow"]}, f.scorer, contact, task)  # pyright: ignore
-        axis, arm = self.joint_axis(params, f, contact, task)
-        return articulation_flow(normalize(axis), arm, task, hinge=True)
+            return apply(self._flow, params["flow"], f.scorer, contact, goal)
+        axis, arm = self.joint_axis(params, f, contact, goal)
+        return articulation_flow(normalize(axis), arm, goal, hinge=True)
 
     def joint_axis(
-        self, params: Params, f: Features, contact: jax.Array, task: jax.Array
+        self, params: Params, f: Features, contact: jax.Array, goal: jax.Array
     ) -> tuple[jax.Array, jax.Array]:
-        """The axis [..., 3] that the part turns about, of a length near 1 and signed as the task turns, and the way
-        [..., 3] (unit lengths) from the contact to the nearest point on it; for networks with `hinge`."""
-        out = self._flow.apply({"params": params["flow"]}, f.scorer, contact, task)
-        return out[..., :3], out[..., 3:] / MOVE_SCALE  # pyright: ignore
+        """The predicted axis [..., 3] that the part turns about, of a length near 1 and signed as the goal turns, and
+        the vector [..., 3] (unit lengths) from the contact to the nearest point on it; with `predict_axis`."""
+        out = apply(self._flow, params["flow"], f.scorer, contact, goal)
+        return out[..., :3], out[..., 3:] / POSITION_SCALE
 
-    def _at(
+    def extra(
+        self, name: str, params: Params, f: Features, contact: jax.Array, goal: jax.Array, *, trajectory: jax.Array
+    ) -> jax.Array:
+        """The output of one of `extra_heads`, which read the scorer's feature."""
+        return apply(self._extra(name), params[name], trajectory, f.scorer, contact, goal)
+
+    def _inputs(
         self,
         params: Params,
         f: Features,
-        own: jax.Array,
+        feature: jax.Array,
         contact: jax.Array,
-        task: jax.Array,
+        goal: jax.Array,
+        *,
         flow: jax.Array | None = None,
     ) -> tuple[jax.Array, ...]:
-        """What every head reads: its own feature, contact, task and, where there is a head for it, the course."""
+        """What every head reads: its own feature, contact, goal and, where there is a head for it, the flow."""
         if not self.config.flow_hidden:
-            return own, contact, task
-        flow = self.flow(params, f, contact, task) if flow is None else flow
-        return own, contact, task, jax.lax.stop_gradient(flow)
+            return feature, contact, goal
+        flow = self.flow(params, f, contact, goal) if flow is None else flow
+        return feature, contact, goal, jax.lax.stop_gradient(flow)
 
     @property
     def _scorer(self) -> TrajectoryHead:
@@ -248,102 +201,5 @@ class Networks:
     def _flow(self) -> Head:
         return Head(self.config, (*self.config.flow_hidden, AXIS_AND_ARM if self.config.predict_axis else FLOW))
 
-
-class Head(nn.Module):
-    """Dense layers on the view's feature, the encoded contact and task, and further inputs, if any."""
-
-    config: NetworksConfig
-    widths: tuple[int, ...]
-
-    @nn.compact
-    def __call__(self, f: jax.Array, contact: jax.Array, task: jax.Array, *more: jax.Array) -> jax.Array:
-        contact = nn.Dense(self.config.contact_dim, name="contact")(contact)
-        task = nn.Dense(self.config.task_dim, name="task")(TASK_SCALE * task[..., None])
-        x = DenseOfParts(self.widths[0])(f, contact, task, *more)
-        for width in self.widths[1:]:
-            x = nn.Dense(width)(nn.leaky_relu(x))
-        return x
-
-
-class TrajectoryHead(nn.Module):
-    """A Head that also reads an encoded trajectory and, where it gets the points around the contact [..., 3 K], what
-    the hand at the start sees of them."""
-
-    config: NetworksConfig
-    widths: tuple[int, ...]
-
-    @nn.compact
-    def __call__(
-        self,
-        trajectory: jax.Array,
-        f: jax.Array,
-        contact: jax.Array,
-        task: jax.Array,
-        *flow: jax.Array,
-        local_groups: jax.Array | None = None,
-    ) -> jax.Array:
-        parts = [trajectory * jnp.array(SCALE)]
-        moved = cumulative_residuals(trajectory)[..., :3]
-        if self.config.absolute_waypoints:
-            # What the residuals sum up to decides whether the part arrives; the encoder need not learn to add.
-            parts.append(_flat(contact[..., None, :] + moved))
-        parts += [_flat(MOVE_SCALE * (moved - unpack_flow(c)[0])) for c in flow]
-        leading = jnp.broadcast_shapes(*(part.shape[:-1] for part in parts))
-        x = jnp.concatenate([jnp.broadcast_to(part, (*leading, part.shape[-1])) for part in parts], -1)
-        for width in self.config.trajectory_hidden[:-1]:
-            x = nn.leaky_relu(nn.Dense(width)(x))
-        more = [nn.Dense(self.config.trajectory_hidden[-1])(x)]
-        if local_groups is not None:
-            points = local_groups.reshape(*local_groups.shape[:-1], local_groups.shape[-1] // 3, 3)
-            seen = HAND_SCALE * points @ matrix_from_rot6d(trajectory[..., :6])
-            more.append(
-                SharedMLP(self.config.gripper_patch_hidden, name="hand")(seen).max(-2)
-            )  # initial values follow from names
-        return Head(self.config, self.widths)(f, contact, task, *flow, *more)
-
-
-def unpack_flow(flow: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """Displacements [..., 4, 3] (unit lengths) and rotation vector [..., 3] (rad) of a course [..., 15]."""
-    places = flow[..., : 3 * WAYPOINTS] / MOVE_SCALE
-    return places.reshape(*places.shape[:-1], WAYPOINTS, 3), flow[..., 3 * WAYPOINTS :] / TURN_SCALE
-
-
-def pack_flow(places: jax.Array, turn: jax.Array) -> jax.Array:
-    """The inverse of `unpack_flow`."""
-    return jnp.concatenate([MOVE_SCALE * _flat(places), TURN_SCALE * turn], -1)
-
-
-def articulation_flow(axis: jax.Array, arm: jax.Array, task: jax.Array, hinge: bool) -> jax.Array:
-    """The course [..., 15] of points whose part turns about an axis (`hinge`) or slides along it by task [...].
-
-    axis: [..., 3] unit; arm: [..., 3] from the point to any point on a hinge's axis.
-    """
-    amount = task[..., None] * jnp.arange(1, WAYPOINTS + 1) / WAYPOINTS
-    arm = arm[..., None, :]
-    places = apply_joint_motion(jnp.zeros_like(arm), axis[..., None, :], arm, amount, hinge)
-    turn = axis * task[..., None]
-    return pack_flow(places, turn if hinge else jnp.zeros_like(turn))
-
-
-def _flat(x: jax.Array) -> jax.Array:
-    return x.reshape(*x.shape[:-2], x.shape[-2] * x.shape[-1])
-
-
-class DenseOfParts(nn.Module):
-    """A dense layer on the concatenation of parts [..., d_i], whose leading dimensions may differ and broadcast.
-
-    The sum of one product per part, so that a part that many rows share is multiplied once.
-    """
-
-    width: int
-
-    @nn.compact
-    def __call__(self, *parts: jax.Array) -> jax.Array:
-        sizes = [part.shape[-1] for part in parts]
-        kernel = self.param("kernel", nn.initializers.lecun_normal(), (sum(sizes), self.width))
-        total = self.param("bias", nn.initializers.zeros, (self.width,))
-        start = 0
-        for part, size in zip(parts, sizes, strict=True):
-            total = total + part @ kernel[start : start + size]
-            start += size
-        return total
+    def _extra(self, name: str) -> nn.Module:
+        return HEADS.get(name)(self.config)

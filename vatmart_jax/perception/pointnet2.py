@@ -1,9 +1,9 @@
 """PointNet++ (single-scale grouping, segmentation) in pure JAX.
 
-Which points are sampled, grouped and interpolated depends on a cloud alone, not on the weights: `group` finds it once
-per view, and every pass of the network reuses it. Points that the network is asked about (`queries`: contact
-candidates, or the cloud itself for a heat map) are not sampled; their features are interpolated and, where the config
-says so, joined by what lies around each of them, which shows a handle that coarse levels miss.
+Which points are sampled, grouped and interpolated depends on a cloud alone, not on the weights: `group` computes it
+once per view, and every pass of the network reuses it. Query points (contact candidates, or the cloud itself for a
+heat map) are not sampled; their features are interpolated and, where the config has local groups, joined by a feature
+of the points around each of them, which resolves handles that the coarse levels miss.
 
 Source: Qi et al. 2017; sizes as in VAT-Mart's and Where2Act's released networks.
 """
@@ -12,12 +12,17 @@ from __future__ import annotations
 
 import itertools
 from dataclasses import dataclass
+from typing import ClassVar
 
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
-import numpy as np
-from flax import struct
+from flax.struct import PyTreeNode
+
+from vatmart_jax.perception.augmentation import SceneTransform
+from vatmart_jax.perception.encoder import EncoderConfig
+from vatmart_jax.perception.layers import Params, SharedMLP, apply, init
+from vatmart_jax.perception.point_ops import ball_query, compact, farthest_points, take, three_nearest
 
 
 @dataclass(frozen=True)
@@ -40,8 +45,10 @@ class LocalGroup:
 
 
 @dataclass(frozen=True)
-class PointNet2Config:
+class PointNet2Config(EncoderConfig):
     """Sizes of one PointNet++; the defaults are the paper's."""
+
+    kind: ClassVar[str] = "pointnet2"
 
     n_points: int = 10_000
     """Points of a view that training sees; inference takes any number."""
@@ -61,11 +68,14 @@ class PointNet2Config:
     global_context: tuple[int, ...] = ()
     """Widths of a network over all of the second level's centroids as each query sees them; the paper has none."""
 
+    def build(self) -> PointNet2Encoder:
+        return PointNet2Encoder(self)
+
     def __post_init__(self) -> None:
         if len(self.levels) != len(self.propagation):
             raise ValueError(f"{len(self.levels)} levels need as many propagations, not {len(self.propagation)}")
         if self.global_context and len(self.levels) < 2:
-            raise ValueError("a context needs two levels, for it is made of the second's centroids")
+            raise ValueError("global_context needs two levels: it reads the centroids of the second")
 
 
 SMALL = PointNet2Config(
@@ -82,8 +92,7 @@ SMALL = PointNet2Config(
 """A ninth of the paper's arithmetic per view, for two CPU cores."""
 
 
-@struct.dataclass
-class PointGroups:
+class PointGroups(PyTreeNode, kw_only=True):
     """The index structure of one view: N points, C queries, L levels with M_1 > ... > M_L centroids (M_0 = N).
 
     Indices are int16 where they fit, else int32; a batch of views has a leading dimension everywhere.
@@ -97,78 +106,50 @@ class PointGroups:
     local_groups: tuple[jax.Array, ...]  # one of [C, k] for each of the config's, into the cloud
 
 
-def farthest_points(points: jax.Array, count: int) -> jax.Array:
-    """Indices [count] int32 of points [N, 3]: the first point, then each time the one farthest from all before.
+@dataclass(frozen=True)
+class PointNet2Encoder:
+    """PointNet++ as a PointEncoder."""
 
-    Of equally far points the one with the lowest index. Points repeat where count > N.
-    """
-    x, y, z = points.T
-    order = jnp.arange(len(points), dtype=jnp.int32)
+    config: PointNet2Config
 
-    def add(i: int, carry: tuple[jax.Array, jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array, jax.Array]:
-        chosen, square, last = carry
-        square = jnp.minimum(square, (x - x[last]) ** 2 + (y - y[last]) ** 2 + (z - z[last]) ** 2)
-        # A maximum and a minimum vectorise on CPU, an argmax does not: 9 ms against 77 for 1,024 of 10,000.
-        last = jnp.min(jnp.where(square == square.max(), order, len(points)))
-        return chosen.at[i].set(last), square, last
+    @property
+    def num_points(self) -> int:
+        return self.config.n_points
 
-    start = (jnp.zeros(count, jnp.int32), jnp.full(len(points), jnp.inf), jnp.int32(0))
-    return jax.lax.fori_loop(1, count, add, start)[0]
+    @property
+    def feature_dim(self) -> int:
+        return self.config.feature_dim
 
+    @property
+    def num_local_points(self) -> int:
+        return sum(local.max_neighbors for local in self.config.local_groups)
 
-def ball_query(points: jax.Array, centres: jax.Array, radius: float, count: int) -> jax.Array:
-    """Indices [M, count] int32 of the first `count` points [N, 3] closer than radius to centres [M, 3].
+    def prepare(self, points: jax.Array, queries: jax.Array) -> PointGroups:
+        return group(points, queries, self.config)
 
-    Where there are fewer, the first repeats (as in the reference CUDA code); where there is none, index 0. Points in
-    random order make this a random choice among those inside.
-    """
-    inside = _square_distances(centres, points) < radius * radius
-    inside = jnp.pad(inside, ((0, 0), (0, -len(points) % 32))).reshape(len(centres), -1, 32)
-    # No sort: hits become bits of 32-bit words, and the k-th hit is found by counting bits. On CPU `top_k` of the
-    # masked indices takes 1.7 s where this takes 60 ms (1,024 centres, 10,000 points).
-    words = jnp.sum(inside.astype(jnp.uint32) << jnp.arange(32, dtype=jnp.uint32), -1, dtype=jnp.uint32)
-    total = jnp.cumsum(_bits(words), -1)
-    rank = jnp.arange(count)
-    rank = jnp.where(rank < total[:, -1:], rank, 0)
-    word = jnp.sum(total[:, None] <= rank[..., None], -1)
-    word = jnp.where(total[:, -1:] > 0, word, 0)
-    rank = rank - jnp.take_along_axis(total - _bits(words), word, 1)
-    bits = jnp.take_along_axis(words, word, 1)
-    bit = jnp.zeros_like(rank)
-    for half in (16, 8, 4, 2, 1):
-        low = bits & jnp.uint32((1 << half) - 1)
-        above = rank >= _bits(low)
-        rank = jnp.where(above, rank - _bits(low), rank)
-        bits = jnp.where(above, bits >> half, low)
-        bit = jnp.where(above, bit + half, bit)
-    return jnp.where(total[:, -1:] > 0, word * 32 + bit, 0).astype(jnp.int32)
+    def transform(self, prepared: PointGroups, transform: SceneTransform) -> PointGroups:
+        """Neighbours stay neighbours; a scaled scene has groups of scaled radius."""
+        return prepared.replace(queries=transform.points(prepared.queries))
 
+    def init(self, key: jax.Array) -> Params:
+        points, queries = jnp.zeros((self.num_points, 3)), jnp.zeros((1, 3))
+        shapes = jax.eval_shape(self.prepare, points, queries)
+        prepared = jax.tree.map(lambda a: jnp.zeros(a.shape, a.dtype), shapes)
+        return init(PointNet2(self.config), key, points, prepared)
 
-def three_nearest(targets: jax.Array, sources: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """The three sources [M, 3] nearest to each target [T, 3], M >= 3: indices [T, 3] int32 and weights [T, 3].
+    def apply(
+        self, params: Params, points: jax.Array, prepared: PointGroups, query_index: jax.Array | None = None
+    ) -> jax.Array:
+        return apply(PointNet2(self.config), params, points, prepared, query_index)
 
-    Weights are proportional to the inverse squared distance and sum to 1, as in the reference CUDA code.
-    """
-    x, y, z = targets.T
-
-    def insert(j: int, carry: tuple[tuple[jax.Array, ...], tuple[jax.Array, ...]]) -> tuple:
-        (a, b, c), (i, k, m) = carry
-        d = (x - sources[j, 0]) ** 2 + (y - sources[j, 1]) ** 2 + (z - sources[j, 2]) ** 2
-        first, second, third = d < a, d < b, d < c
-        where = jnp.where
-        return (
-            (where(first, d, a), where(first, a, where(second, d, b)), where(second, b, where(third, d, c))),
-            (where(first, j, i), where(first, i, where(second, j, k)), where(second, k, where(third, j, m))),
-        )
-
-    far, none = jnp.full(len(targets), jnp.inf), jnp.zeros(len(targets), jnp.int32)
-    square, index = jax.lax.fori_loop(0, len(sources), insert, ((far,) * 3, (none,) * 3))
-    inverse = 1 / (jnp.stack(square, -1) + 1e-8)
-    return jnp.stack(index, -1), inverse / inverse.sum(-1, keepdims=True)
+    def local_offsets(
+        self, points: jax.Array, prepared: PointGroups, query_index: jax.Array | None = None
+    ) -> jax.Array:
+        return jnp.concatenate(local_offsets(points, prepared, query_index), -2)
 
 
 def group(points: jax.Array, queries: jax.Array, config: PointNet2Config) -> PointGroups:
-    """The Grouping of a cloud [N, 3] and queries [C, 3]. Jits, and vmaps over views.
+    """The PointGroups of a cloud [N, 3] and queries [C, 3]. Jits, and vmaps over views.
 
     Points should be in random order (see `ball_query`).
     """
@@ -180,43 +161,34 @@ def group(points: jax.Array, queries: jax.Array, config: PointNet2Config) -> Poi
         xyz = below[chosen]
         members = ball_query(below, xyz, level.radius, level.max_neighbors)
         closest, weight = three_nearest(targets, xyz)
-        centroids.append(_compact(chosen, len(below)))
-        neighbors.append(_compact(members, len(below)))
-        nearest.append(_compact(closest, level.num_centroids))
+        centroids.append(compact(chosen, len(below)))
+        neighbors.append(compact(members, len(below)))
+        nearest.append(compact(closest, level.num_centroids))
         weights.append(weight.astype(jnp.float16))
         below = targets = xyz
     local_groups = tuple(
-        _compact(ball_query(points, queries, a.radius, a.max_neighbors), len(points)) for a in config.local_groups
+        compact(ball_query(points, queries, a.radius, a.max_neighbors), len(points)) for a in config.local_groups
     )
-    return PointGroups(queries, tuple(centroids), tuple(neighbors), tuple(nearest), tuple(weights), local_groups)
+    return PointGroups(
+        queries=queries,
+        centroids=tuple(centroids),
+        neighbors=tuple(neighbors),
+        nearest=tuple(nearest),
+        weights=tuple(weights),
+        local_groups=local_groups,
+    )
 
 
 def local_offsets(
-    points: jax.Array, point_groups: PointGroups, which: jax.Array | None = None
+    points: jax.Array, point_groups: PointGroups, query_index: jax.Array | None = None
 ) -> tuple[jax.Array, ...]:
     """Offsets [Q, k, 3] from queries to the points of each group about them.
 
-    points: [N, 3]. which: [Q] int into the queries, None for all.
+    points: [N, 3]. query_index: [Q] int into the queries, None for all.
     """
-    of_query = (lambda x: x) if which is None else (lambda x: _take(x, which))
+    of_query = (lambda x: x) if query_index is None else (lambda x: take(x, query_index))
     place = of_query(point_groups.queries)[:, None]
-    return tuple(_take(points.astype(jnp.float32), of_query(members)) - place for members in point_groups.local_groups)
-
-
-class SharedMLP(nn.Module):
-    """Dense layers with ReLU, the same for every point [..., d] -> [..., widths[-1]].
-
-    Without normalisation: batch statistics would be mutable state and tie a view's features to its batch, and layer
-    normalisation took a quarter more time here and learned no better.
-    """
-
-    widths: tuple[int, ...]
-
-    @nn.compact
-    def __call__(self, x: jax.Array) -> jax.Array:
-        for width in self.widths:
-            x = nn.relu(nn.Dense(width, kernel_init=nn.initializers.he_normal())(x))
-        return x
+    return tuple(take(points.astype(jnp.float32), of_query(members)) - place for members in point_groups.local_groups)
 
 
 class PointNet2(nn.Module):
@@ -225,8 +197,8 @@ class PointNet2(nn.Module):
     config: PointNet2Config
 
     @nn.compact
-    def __call__(self, points: jax.Array, point_groups: PointGroups, which: jax.Array | None = None) -> jax.Array:
-        """points: [N, 3]. which: [Q] int into the queries, None for all. Returns [Q, feature_dim]."""
+    def __call__(self, points: jax.Array, point_groups: PointGroups, query_index: jax.Array | None = None) -> jax.Array:
+        """points: [N, 3]. query_index: [Q] int into the queries, None for all. Returns [Q, feature_dim]."""
         levels, number = self.config.levels, itertools.count()
 
         def mlp(widths: tuple[int, ...]) -> SharedMLP:
@@ -236,22 +208,24 @@ class PointNet2(nn.Module):
         xyz = points.astype(jnp.float32)
         skips, centroids = [xyz], [xyz]
         for level, chosen, members in zip(levels, point_groups.centroids, point_groups.neighbors, strict=True):
-            centres = _take(xyz, chosen)
-            offset = (_take(xyz, members) - centres[:, None]) / level.radius
-            grouped = jnp.concatenate([offset, _take(skips[-1], members)], -1)
+            centres = take(xyz, chosen)
+            offset = (take(xyz, members) - centres[:, None]) / level.radius
+            grouped = jnp.concatenate([offset, take(skips[-1], members)], -1)
             skips.append(mlp(level.widths)(grouped).max(-2))
             xyz = centres
             centroids.append(xyz)
-        skips[0] = point_groups.queries if which is None else _take(point_groups.queries, which)
+        skips[0] = point_groups.queries if query_index is None else take(point_groups.queries, query_index)
         features = skips[-1]
         for depth in reversed(range(len(levels))):
             nearest, weights = point_groups.nearest[depth], point_groups.weights[depth]
-            if depth == 0 and which is not None:
-                nearest, weights = _take(nearest, which), _take(weights, which)
-            tta_transforms = jnp.sum(_take(features, nearest) * weights[..., None].astype(jnp.float32), -2)
-            features = mlp(self.config.propagation[depth])(jnp.concatenate([tta_transforms, skips[depth]], -1))
+            if depth == 0 and query_index is not None:
+                nearest, weights = take(nearest, query_index), take(weights, query_index)
+            interpolated = jnp.sum(take(features, nearest) * weights[..., None].astype(jnp.float32), -2)
+            features = mlp(self.config.propagation[depth])(jnp.concatenate([interpolated, skips[depth]], -1))
         parts = [features]
-        for kind, offset in zip(self.config.local_groups, local_offsets(points, point_groups, which), strict=True):
+        for kind, offset in zip(
+            self.config.local_groups, local_offsets(points, point_groups, query_index), strict=True
+        ):
             offset = offset / kind.radius
             # A query with no point near has one from elsewhere, at a distance that means nothing.
             inside = jnp.sum(offset**2, -1, keepdims=True) <= 1.01
@@ -263,20 +237,3 @@ class PointNet2(nn.Module):
             seen = nn.Dense(width, name="context_seen")(skips[2]) + place(centroids[2])
             parts.append(mlp(tuple(more))(nn.relu(seen - place(skips[0])[:, None])).max(-2))
         return mlp((self.config.feature_dim,))(jnp.concatenate(parts, -1))
-
-
-def _take(x: jax.Array, index: jax.Array) -> jax.Array:
-    return x.at[index].get(mode="promise_in_bounds")
-
-
-def _square_distances(a: jax.Array, b: jax.Array) -> jax.Array:
-    # Differences, not |a|^2 + |b|^2 - 2ab: the latter loses points on a ball's rim to rounding.
-    return sum((a[:, None, i] - b[None, :, i]) ** 2 for i in range(3))  # pyright: ignore[reportReturnType]
-
-
-def _bits(words: jax.Array) -> jax.Array:
-    return jax.lax.population_count(words).astype(jnp.int32)
-
-
-def _compact(index: jax.Array, size: int) -> jax.Array:
-    return index.astype(jnp.int16 if size <= np.iinfo(np.int16).max else jnp.int32)

@@ -1,6 +1,7 @@
-"""What trained networks say of views: where to act, how, and how likely that is to do the task.
+"""Predictions of trained networks for views: where to act, how, and with what success probability.
 
-An `TTAPredictor` asks them about a view and about mirrored and turned copies of it; the scores it gives are means.
+A `TTAPredictor` averages scores over a view and mirrored and turned copies of it (test-time augmentation). The jitted
+functions below it do so for batches of views.
 """
 
 from __future__ import annotations
@@ -14,70 +15,74 @@ import jax
 import jax.numpy as jnp
 
 from vatmart_jax.perception.augmentation import SceneTransform, tta_transforms
+from vatmart_jax.perception.encoder import Prepared
 from vatmart_jax.perception.grouped_views import GroupedViews
-from vatmart_jax.perception.networks import Features, Networks, Params
-from vatmart_jax.perception.pointnet2 import PointGroups
+from vatmart_jax.perception.layers import Params
+from vatmart_jax.perception.networks import Features, Networks
 
 
 @dataclass(frozen=True)
 class TTAPredictor:
-    """The networks, asked about `num_augmentations` of a view (1: the view alone).
+    """The networks, evaluated on `num_augmentations` of a view (1: the view alone).
 
-    Heads broadcast as those of `Networks` do, with features that carry a leading dimension for the copies; contacts
-    and trajectories are those of the view as it is.
+    Heads broadcast as those of `Networks` do, with features that carry a leading dimension for the augmentations;
+    contacts and trajectories are those of the view as it is.
     """
 
     networks: Networks
     num_augmentations: int = 1
 
     def features(
-        self, params: Params, points: jax.Array, point_groups: PointGroups, which: jax.Array | None = None
+        self, params: Params, points: jax.Array, prepared: Prepared, query_index: jax.Array | None = None
     ) -> Features:
-        """Features [copies, Q, F] of one view: points [N, 3], which [Q] int into the grouping's queries (None: all)."""
+        """Features [A, Q, F] of one view, A augmentations of it: points [N, 3], query_index [Q] int into the queries
+        that it was prepared with (None: all)."""
 
-        def of_copy(transform: SceneTransform) -> Features:
-            queries = transform.points(point_groups.queries)
-            return self.networks.features(
-                params, transform.points(points), point_groups.replace(queries=queries), which
-            )
+        def of_one(transform: SceneTransform) -> Features:
+            transformed = self.networks.encoder.transform(prepared, transform)
+            return self.networks.features(params, transform.points(points), transformed, query_index)
 
-        return jax.lax.map(
-            of_copy, tta_transforms(self.num_augmentations)
-        )  # by turns: the groups of one copy fill the caches
+        # One after the other: the groups of one copy fill the caches.
+        return jax.lax.map(of_one, tta_transforms(self.num_augmentations))
 
-    def actionability(self, params: Params, f: Features, contact: jax.Array, task: jax.Array) -> jax.Array:
+    def actionability(self, params: Params, f: Features, contact: jax.Array, goal: jax.Array) -> jax.Array:
         """Actionability [...] as a probability."""
-        of_copy = lambda t, f: jax.nn.sigmoid(self.networks.actionability(params, f, t.points(contact), task))
-        return jax.vmap(of_copy)(tta_transforms(self.num_augmentations), f).mean(0)
+        of_one = lambda t, f: jax.nn.sigmoid(self.networks.actionability(params, f, t.points(contact), goal))
+        return jax.vmap(of_one)(tta_transforms(self.num_augmentations), f).mean(0)
 
     def score(
-        self, params: Params, f: Features, contact: jax.Array, task: jax.Array, trajectory: jax.Array
+        self, params: Params, f: Features, contact: jax.Array, goal: jax.Array, trajectory: jax.Array
     ) -> jax.Array:
-        """Probability [...] that the trajectory does the task."""
+        """Predicted success probability [...] of the trajectory."""
 
-        def of_copy(transform: SceneTransform, f: Features) -> jax.Array:
-            asked = transform.points(contact), task, transform.trajectory(trajectory)
-            return jax.nn.sigmoid(self.networks.score(params, f, *asked))
+        def of_one(transform: SceneTransform, f: Features) -> jax.Array:
+            inputs = transform.points(contact), goal, transform.trajectory(trajectory)
+            return jax.nn.sigmoid(self.networks.score(params, f, *inputs))
 
-        return jax.vmap(of_copy)(tta_transforms(self.num_augmentations), f).mean(0)
+        return jax.vmap(of_one)(tta_transforms(self.num_augmentations), f).mean(0)
 
     def propose(
-        self, params: Params, f: Features, contact: jax.Array, task: jax.Array, key: jax.Array, count: int
-    ) -> tuple[jax.Array, jax.Array]:
-        """Trajectories [..., count, 30] for the view as it is, and their scores [..., count].
+        self, params: Params, f: Features, contact: jax.Array, goal: jax.Array, key: jax.Array, count: int
+    ) -> jax.Array:
+        """Trajectories [..., count, 30] for the view as it is, at contacts [..., 3] with goals [...].
 
-        Contacts [..., 3] and tasks [...]. Those made for the copies and brought back succeed less (docs/learning.md).
-        Consumes the key.
+        Those made for the copies and brought back succeed less (docs/learning.md). Consumes the key.
         """
-        lifted = Features(*(x[..., None, :] for x in f)), contact[..., None, :], task[..., None]
         z = jax.random.normal(key, (count, self.networks.config.latent_dim))
-        itself = Features(*(x[0] for x in lifted[0]))
-        proposed = self.networks.propose(params, itself, *lifted[1:], z)
-        return proposed, self.score(params, *lifted, proposed)
+        itself = Features(*(x[0][..., None, :] for x in f))
+        return self.networks.propose(params, itself, contact[..., None, :], goal[..., None], z)
+
+    def propose_and_score(
+        self, params: Params, f: Features, contact: jax.Array, goal: jax.Array, key: jax.Array, count: int
+    ) -> tuple[jax.Array, jax.Array]:
+        """As `propose`, and the trajectories' scores [..., count]. Consumes the key."""
+        trajectory = self.propose(params, f, contact, goal, key, count)
+        lifted = Features(*(x[..., None, :] for x in f))
+        return trajectory, self.score(params, lifted, contact[..., None, :], goal[..., None], trajectory)
 
 
 class Selection(NamedTuple):
-    """What the networks would do in B views."""
+    """The networks' choice in B views."""
 
     contact: jax.Array  # [B] int32, index into the view's contacts
     trajectory: jax.Array  # [B, 30]
@@ -85,86 +90,124 @@ class Selection(NamedTuple):
     actionability: jax.Array  # [B, C] probability
 
 
-@partial(jax.jit, static_argnames=("predictor", "n_proposals"))
+class EncodedContacts(NamedTuple):
+    """One contact in each of B views, encoded."""
+
+    features: Features  # [B, A, F], A augmentations
+    contact: jax.Array  # [B, 3] object frame
+
+
+@partial(jax.jit, static_argnames=("predictor", "num_proposals"))
 def select_actions(
     predictor: TTAPredictor,
     params: Params,
     grouped_views: GroupedViews,
     view: jax.Array,
-    task: jax.Array,
+    goal: jax.Array,
+    *,
     key: jax.Array,
-    n_proposals: int = 100,
+    num_proposals: int = 100,
 ) -> Selection:
-    """The contact of highest actionability in each view [B], and its best-scored of n_proposals trajectories.
+    """The contact of highest actionability in each view [B], and its best-scored of num_proposals trajectories.
 
-    task: [B] > 0, rad or unit lengths. Consumes the key (paper, B: downstream manipulation).
+    goal: [B] > 0, rad or unit lengths. Consumes the key (paper, B: downstream manipulation).
     """
 
-    def select(view: jax.Array, task: jax.Array, key: jax.Array) -> Selection:
+    def select(view: jax.Array, goal: jax.Array, key: jax.Array) -> Selection:
         contacts = grouped_views.contacts[view]
         f = _encode(predictor, params, grouped_views, view)
-        actionability = predictor.actionability(params, f, contacts, task)
+        actionability = predictor.actionability(params, f, contacts, goal)
         contact = jnp.argmax(actionability).astype(jnp.int32)
         at = Features(*(x[:, contact] for x in f))
-        trajectory, score = predictor.propose(params, at, contacts[contact], task, key, n_proposals)
+        trajectory, score = predictor.propose_and_score(params, at, contacts[contact], goal, key, num_proposals)
         best = jnp.argmax(score)
         return Selection(contact, trajectory[best], score[best], actionability)
 
-    return _over_rows(select, view, task, jax.random.split(key, len(view)))
+    return _over_rows(select, view, goal, jax.random.split(key, len(view)))
 
 
-@partial(jax.jit, static_argnames=("predictor", "n_proposals"))
+@partial(jax.jit, static_argnames=("predictor",))
+def encode_contacts(
+    predictor: TTAPredictor, params: Params, grouped_views: GroupedViews, view: jax.Array, contact: jax.Array
+) -> EncodedContacts:
+    """Contacts [B] int of views [B], encoded once for any number of proposals and scores."""
+
+    def encode(view: jax.Array, contact: jax.Array) -> EncodedContacts:
+        f = _encode(predictor, params, grouped_views, view, contact)
+        return EncodedContacts(f, grouped_views.contacts[view, contact])
+
+    return _over_rows(encode, view, contact)
+
+
+@partial(jax.jit, static_argnames=("predictor", "num_proposals"))
+def propose_from(
+    predictor: TTAPredictor,
+    params: Params,
+    encoded: EncodedContacts,
+    goal: jax.Array,
+    *,
+    key: jax.Array,
+    num_proposals: int = 100,
+) -> jax.Array:
+    """Proposals [B, P, 30] at encoded contacts for goals [B], without scores. Consumes the key."""
+    propose = lambda at, goal, key: predictor.propose(params, at.features, at.contact, goal, key, num_proposals)
+    return _over_rows(propose, encoded, goal, jax.random.split(key, len(goal)))
+
+
+@partial(jax.jit, static_argnames=("predictor", "num_proposals"))
 def propose_trajectories(
     predictor: TTAPredictor,
     params: Params,
     grouped_views: GroupedViews,
     view: jax.Array,
     contact: jax.Array,
-    task: jax.Array,
+    *,
+    goal: jax.Array,
     key: jax.Array,
-    n_proposals: int = 100,
+    num_proposals: int = 100,
 ) -> tuple[jax.Array, jax.Array]:
     """Proposals [B, P, 30] and their scores [B, P] (probabilities) at given contacts [B] int. Consumes the key."""
 
-    def propose(view: jax.Array, contact: jax.Array, task: jax.Array, key: jax.Array) -> tuple[jax.Array, jax.Array]:
+    def propose(view: jax.Array, contact: jax.Array, goal: jax.Array, key: jax.Array) -> tuple[jax.Array, jax.Array]:
         f = _encode(predictor, params, grouped_views, view, contact)
-        return predictor.propose(params, f, grouped_views.contacts[view, contact], task, key, n_proposals)
+        return predictor.propose_and_score(params, f, grouped_views.contacts[view, contact], goal, key, num_proposals)
 
-    return _over_rows(propose, view, contact, task, jax.random.split(key, len(view)))
+    return _over_rows(propose, view, contact, goal, jax.random.split(key, len(view)))
 
 
-@partial(jax.jit, static_argnames=("predictor", "n_proposals"))
+@partial(jax.jit, static_argnames=("predictor", "num_proposals"))
 def explore_actions(
     predictor: TTAPredictor,
     params: Params,
     grouped_views: GroupedViews,
     view: jax.Array,
     contact: jax.Array,
-    task: jax.Array,
+    *,
+    goal: jax.Array,
     key: jax.Array,
-    n_proposals: int = 100,
+    num_proposals: int = 100,
 ) -> tuple[jax.Array, jax.Array]:
-    """What to try for views [V], T tasks in each [V, T]; one encoder pass per view serves all of them.
+    """What to try for views [V], T goals in each [V, T]; one encoder pass per view serves all of them.
 
-    Of four tasks in a row, the first gets what `select_actions` would choose; the second the best proposal at a contact
+    Of four goals in a row, the first gets what `select_actions` would choose; the second the best proposal at a contact
     drawn by actionability, the third at the given contact [V, T], and the last any proposal there. Returns contacts
     [V, T] and trajectories [V, T, 30]. Consumes the key.
     """
 
-    def explore(view: jax.Array, contact: jax.Array, task: jax.Array, key: jax.Array) -> tuple[jax.Array, jax.Array]:
+    def explore(view: jax.Array, contact: jax.Array, goal: jax.Array, key: jax.Array) -> tuple[jax.Array, jax.Array]:
         k_contact, k_proposals, k_pick = jax.random.split(key, 3)
         contacts = grouped_views.contacts[view]
         f = _encode(predictor, params, grouped_views, view)
-        actionability = predictor.actionability(params, f, contacts, task[:, None])  # [T, C]
-        kind = jnp.arange(len(task)) % 4
+        actionability = predictor.actionability(params, f, contacts, goal[:, None])  # [T, C]
+        kind = jnp.arange(len(goal)) % 4
         drawn = jax.random.categorical(k_contact, jnp.log(actionability))
         contact = jnp.select([kind == 0, kind == 1], [jnp.argmax(actionability, -1), drawn], contact).astype(jnp.int32)
         at = Features(*(x[:, contact] for x in f))
-        trajectory, score = predictor.propose(params, at, contacts[contact], task, k_proposals, n_proposals)
-        pick = jnp.where(kind == 3, jax.random.randint(k_pick, kind.shape, 0, n_proposals), score.argmax(-1))
-        return contact, trajectory[jnp.arange(len(task)), pick]
+        trajectory, score = predictor.propose_and_score(params, at, contacts[contact], goal, k_proposals, num_proposals)
+        pick = jnp.where(kind == 3, jax.random.randint(k_pick, kind.shape, 0, num_proposals), score.argmax(-1))
+        return contact, trajectory[jnp.arange(len(goal)), pick]
 
-    return _over_rows(explore, view, contact, task, jax.random.split(key, len(view)))
+    return _over_rows(explore, view, contact, goal, jax.random.split(key, len(view)))
 
 
 @partial(jax.jit, static_argnames=("predictor",))
@@ -174,16 +217,17 @@ def score_trajectories(
     grouped_views: GroupedViews,
     view: jax.Array,
     contact: jax.Array,
-    task: jax.Array,
+    *,
+    goal: jax.Array,
     trajectory: jax.Array,
 ) -> jax.Array:
-    """Probability [B] that trajectories [B, 30] from contacts [B] int do the tasks [B]."""
+    """Predicted success probability [B] of trajectories [B, 30] from contacts [B] int under the goals [B]."""
 
-    def score(view: jax.Array, contact: jax.Array, task: jax.Array, trajectory: jax.Array) -> jax.Array:
+    def score(view: jax.Array, contact: jax.Array, goal: jax.Array, trajectory: jax.Array) -> jax.Array:
         f = _encode(predictor, params, grouped_views, view, contact)
-        return predictor.score(params, f, grouped_views.contacts[view, contact], task, trajectory)
+        return predictor.score(params, f, grouped_views.contacts[view, contact], goal, trajectory)
 
-    return _over_rows(score, view, contact, task, trajectory)
+    return _over_rows(score, view, contact, goal, trajectory)
 
 
 def _encode(
@@ -193,13 +237,14 @@ def _encode(
     view: jax.Array,
     contact: jax.Array | None = None,
 ) -> Features:
-    """Features [copies, C, F] of one view's contacts, or [copies, F] of one of them."""
-    points, point_groups = jax.tree.map(lambda a: a[view], (grouped_views.points, grouped_views.point_groups))
+    """Features [A, C, F] of one view's contacts, or [A, F] of one of them."""
+    points, prepared = jax.tree.map(lambda a: a[view], (grouped_views.points, grouped_views.prepared))
     if contact is None:
-        return predictor.features(params, points, point_groups)
-    return Features(*(x[:, 0] for x in predictor.features(params, points, point_groups, contact[None])))
+        return predictor.features(params, points, prepared)
+    return Features(*(x[:, 0] for x in predictor.features(params, points, prepared, contact[None])))
 
 
-def _over_rows(function: Callable, *rows: jax.Array):
+def _over_rows(function: Callable, *rows):
     """function over the leading dimension, some rows at a time: a whole batch's groups would not fit into memory."""
-    return jax.lax.map(lambda row: function(*row), rows, batch_size=min(16, len(rows[0])))
+    size = min(16, len(jax.tree.leaves(rows)[0]))
+    return jax.lax.map(lambda row: function(*row), rows, batch_size=size)

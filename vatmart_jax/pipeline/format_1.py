@@ -51,7 +51,7 @@ def settings(value: Mapping[str, Any]) -> dict[str, Any]:
         "env": renamed(value["env"], _ENV),
         "physics": renamed({k: v for k, v in value["physics"].items() if k not in _OF_THE_GRIPPER}, _PHYSICS),
         "explore": explore | {"td3": renamed(explore["td3"], _TD3)},
-        "perception": renamed(perception, _PERCEPTION),
+        "perception": perception_format_1.grouped_augmentation(renamed(perception, _PERCEPTION)),
         "schedule": renamed(value["schedule"], _SCHEDULE),
         "evaluation": renamed(value["evaluation"], _EVALUATION),
     }

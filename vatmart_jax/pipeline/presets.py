@@ -7,9 +7,8 @@ from dataclasses import dataclass, field, replace
 import jax
 
 from vatmart_jax.envs import EnvConfig
-from vatmart_jax.perception.networks import NetworksConfig
+from vatmart_jax.perception.config import AugmentationConfig, NetworksConfig, PerceptionConfig
 from vatmart_jax.perception.pointnet2 import SMALL
-from vatmart_jax.perception.trainer import PerceptionConfig
 from vatmart_jax.physics import PhysicsConfig
 from vatmart_jax.pipeline.exploration import ExplorationConfig
 from vatmart_jax.rl.td3 import TD3Config
@@ -144,9 +143,7 @@ PRESETS = {
             views_per_batch=8,
             samples_per_view=4,
             actionability_queries=4,
-            mirror=False,
-            yaw=0.0,
-            scale=0.0,
+            augmentation=AugmentationConfig(yaw=0.0, mirror=False, scale=0.0),
             free_bits=0.0,
             learning_rate=1e-3,
             muon=False,

@@ -9,9 +9,9 @@ import jax.numpy as jnp
 
 from vatmart_jax.envs import Env, EnvState, TrialStart
 from vatmart_jax.perception.grouped_views import GroupedViews
-from vatmart_jax.perception.networks import Params
+from vatmart_jax.perception.interaction_buffer import Interactions
+from vatmart_jax.perception.layers import Params
 from vatmart_jax.perception.predictor import TTAPredictor, explore_actions, select_actions
-from vatmart_jax.perception.trainer import Interactions
 from vatmart_jax.trajectory import unpack_trajectory
 
 
@@ -19,13 +19,13 @@ def interactions_of(final: EnvState, trajectory: jax.Array | None = None) -> Int
     """The samples [B] that finished trials make; `trajectory` [B, 30] where the networks proposed it."""
     start = final.start
     return Interactions(
-        start.view,
-        start.contact,
-        start.goal,
-        final.trajectory if trajectory is None else trajectory,
-        final.displacement,
-        final.valid & final.grasp_held,
-        jnp.full(start.view.shape, trajectory is not None),
+        view=start.view,
+        contact=start.contact,
+        goal=start.goal,
+        trajectory=final.trajectory if trajectory is None else trajectory,
+        displacement=final.displacement,
+        valid=final.valid & final.grasp_held,
+        from_proposal=jnp.full(start.view.shape, trajectory is not None),
     )
 
 
@@ -48,6 +48,7 @@ class ProposalTrials:
     """Executes what the networks propose in an environment whose views are `grouped_views`."""
 
     def __init__(self, env: Env, grouped_views: GroupedViews, predictor: TTAPredictor, proposals: int):
+        grouped_views.check_same_views(env.views)
         self._env, self._grouped_views, self._ensemble, self._proposals = env, grouped_views, predictor, proposals
         self._execute = jax.jit(self._executed)
         self._sample_by_view = jax.jit(self._sampled_by_view)
@@ -70,7 +71,7 @@ class ProposalTrials:
         Consumes the key.
         """
         chosen = select_actions(
-            self._ensemble, params, self._grouped_views, start.view, start.goal, key, self._proposals
+            self._ensemble, params, self._grouped_views, start.view, start.goal, key=key, num_proposals=self._proposals
         )
         final = self._execute(replace(start, contact=chosen.contact), chosen.trajectory)
         return final, chosen.trajectory, chosen.score
@@ -85,7 +86,7 @@ class ProposalTrials:
         rows = (-1, TASKS_PER_VIEW)
         contact, trajectory = explore_actions(
             self._ensemble, params, self._grouped_views, start.view.reshape(rows)[:, 0], start.contact.reshape(rows),
-            start.goal.reshape(rows), ke, self._proposals,
+            goal=start.goal.reshape(rows), key=ke, num_proposals=self._proposals,
         )  # fmt: skip
         trajectory = trajectory.reshape(len(start.view), -1)
         final = self._execute(replace(start, contact=contact.reshape(-1)), trajectory)

@@ -12,13 +12,15 @@ import jax.numpy as jnp
 import numpy as np
 from flax import struct
 
-from vatmart_jax.data.banks import HINGE, SLIDE
+from vatmart_jax.data.banks import SLIDE
 from vatmart_jax.envs import Env, Task, TrialStart
 from vatmart_jax.perception import trainer as perception
+from vatmart_jax.perception.config import PerceptionConfig, TaskSpec, for_task
 from vatmart_jax.perception.grouped_views import GroupedViews, group_views, network_points
+from vatmart_jax.perception.interaction_buffer import Interactions
 from vatmart_jax.perception.networks import Networks
 from vatmart_jax.perception.predictor import TTAPredictor, score_trajectories
-from vatmart_jax.perception.trainer import Interactions, PerceptionConfig, PerceptionState
+from vatmart_jax.perception.trainer import PerceptionState
 from vatmart_jax.pipeline.exploration import ExplorationLoop, ExplorationState, start_pool
 from vatmart_jax.pipeline.presets import Settings
 from vatmart_jax.pipeline.proposal_rollouts import ProposalTrials, curious, interactions_of
@@ -55,6 +57,7 @@ class PipelineTrainer:
         self._run, self._env, self._settings, self._report = run, env, settings, report
         self._seed = jax.random.key(seed)
         self.config = perception_config(settings, env.task)
+        self._spec = task_spec(env.task, settings.env.tolerance)
         self._ensemble = TTAPredictor(Networks(self.config.networks))
         self._explorer = ExplorationLoop(env, settings.explore)
         self._pool: TrialStart | None = None
@@ -71,7 +74,7 @@ class PipelineTrainer:
         """Nothing done yet."""
         return TrainState(
             explore=self._explorer.init(self.key("policy")),
-            perception=perception.begin(self.key("networks"), self.config),
+            perception=perception.init_state(self.key("networks"), self.config),
             samples=Interactions.empty(self._settings.schedule.buffer_size),
             stored=jnp.int32(0),
             stage=jnp.int32(0),
@@ -181,8 +184,9 @@ class PipelineTrainer:
             progress = self._tick(progress.replace(perception=state), stage, done, steps, metrics)
 
         state = perception.train(
-            progress.perception, self.grouped_views(), progress.samples, self.config, stage, steps, tick
-        )
+            progress.perception, self.grouped_views(), progress.samples, self.config, self._spec,
+            stage=stage, steps=steps, on_metrics=tick,
+        )  # fmt: skip
         return progress.replace(perception=state)
 
     def _round(self, progress: TrainState, steps: int) -> tuple[TrainState, dict[str, float]]:
@@ -191,8 +195,8 @@ class PipelineTrainer:
         last: dict[str, float] = {}
         if steps:
             state = perception.train(
-                progress.perception, self.grouped_views(), progress.samples, config, "joint", steps,
-                lambda _, metrics: last.update(metrics),
+                progress.perception, self.grouped_views(), progress.samples, config, self._spec,
+                stage="joint", steps=steps, on_metrics=lambda _, metrics: last.update(metrics),
             )  # fmt: skip
             progress = progress.replace(perception=state)
             last.pop("step")
@@ -210,7 +214,12 @@ class PipelineTrainer:
                 state, final, metrics = self._explorer.train_iteration(progress.explore, self.pool(), penalty)
                 found = interactions_of(final)
                 score = self._score(
-                    params, self.grouped_views(), found.view, found.contact, found.goal, found.trajectory
+                    params,
+                    self.grouped_views(),
+                    found.view,
+                    found.contact,
+                    goal=found.goal,
+                    trajectory=found.trajectory,
                 )
                 surprising = curious(found, score, self._env.config.tolerance)
                 progress = progress.replace(explore=state).with_samples(surprising)
@@ -239,14 +248,19 @@ class PipelineTrainer:
 
 
 def perception_config(settings: Settings, task: Task) -> PerceptionConfig:
-    """The settings' perception config with the task's limits in it; drawers have no hinge."""
-    networks = settings.perception.networks
-    return replace(
-        settings.perception, low=task.goal_range[0], high=task.goal_range[1],
-        tolerance=settings.env.tolerance, shift=task.relabel_range,
-        task_is_length=task.joint_type == SLIDE,
-        networks=replace(networks, predict_axis=networks.predict_axis and task.joint_type == HINGE),
-    )  # fmt: skip
+    """The settings' perception config with the networks of the task."""
+    networks = for_task(settings.perception.networks, slides=task.joint_type == SLIDE)
+    return replace(settings.perception, networks=networks)
+
+
+def task_spec(task: Task, tolerance: float) -> TaskSpec:
+    """What training the networks needs to know of a task."""
+    return TaskSpec(
+        goal_range=task.goal_range,
+        tolerance=tolerance,
+        relabel_range=task.relabel_range,
+        slides=task.joint_type == SLIDE,
+    )
 
 
 def hash_of(text: str) -> int:
@@ -263,7 +277,7 @@ def _curiosity_penalty(
     """[B] the paper's curiosity reward with its sign turned: weight times the scorer's confidence."""
     start = final.start
     score = score_trajectories(
-        predictor, params, grouped_views, start.view, start.contact, start.goal, final.trajectory
+        predictor, params, grouped_views, start.view, start.contact, goal=start.goal, trajectory=final.trajectory
     )
     return weight * score
 

@@ -26,8 +26,8 @@ def export(priors: Priors, out: Path | str, formats: Sequence[str] = FORMATS, n_
     comes out. Raises UserError for an unknown format or no proposals, before anything is written.
     """
     for name in formats:
-        require_one_of("--format", name, FORMATS)
-    require_positive("--proposals", n_proposals)
+        require_one_of("format", name, FORMATS)
+    require_positive("n_proposals", n_proposals)
     out = Path(out)
     for name in formats:
         if name == "flax":
@@ -38,10 +38,13 @@ def export(priors: Priors, out: Path | str, formats: Sequence[str] = FORMATS, n_
 
 
 def _save_stablehlo(priors: Priors, folder: Path, n_proposals: int) -> None:
-    n = priors.config.networks.encoder.n_points
+    n = priors.predictor.networks.encoder.num_points
 
     def function(points: jax.Array, part_mask: jax.Array, task: jax.Array, seed: jax.Array) -> tuple[jax.Array, ...]:
-        return predict(priors.predictor, priors.params, points, part_mask, task, jax.random.key(seed), n_proposals)
+        return predict(
+            priors.predictor, priors.params, points, part_mask, task,
+            key=jax.random.key(seed), count=n, n_proposals=n_proposals,
+        )  # fmt: skip
 
     inputs = {
         "points": jax.ShapeDtypeStruct((n, 3), jnp.float32),

@@ -1,6 +1,6 @@
 """Trained priors: save, load, and predict from a point cloud.
 
-    priors = Priors.load("run")
+    priors = load_priors("push-door")
     prediction = priors.predict(points, task=0.3)
 
 A folder of priors holds `config.json` and `params.msgpack` (Flax), and needs nothing else.
@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import json
 import math
+import warnings
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -18,19 +19,20 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-import trimesh
 from flax import serialization
 
 from vatmart_jax.atomic_io import atomic_directory, atomic_write, write_json
 from vatmart_jax.config import from_json, to_json
 from vatmart_jax.errors import UserError, require_positive, summarize_error
 from vatmart_jax.perception import format_1
-from vatmart_jax.perception.networks import Features, Networks, NetworksConfig, Params
-from vatmart_jax.perception.pointnet2 import group
+from vatmart_jax.perception.config import NetworksConfig
+from vatmart_jax.perception.layers import Params
+from vatmart_jax.perception.networks import Features, Networks
 from vatmart_jax.perception.predictor import TTAPredictor
 
 FORMAT = 2
 MAX_AUGMENTATIONS = 64  # of a view: a config is untrusted, and memory grows with them
+SMALLEST_BUCKET = 1024
 
 
 class PriorsError(UserError):
@@ -39,17 +41,17 @@ class PriorsError(UserError):
 
 @dataclass(frozen=True)
 class PriorsConfig:
-    """What the priors are of. Amounts are in rad (doors) or unit lengths (drawers)."""
+    """The task and the networks of trained priors. Goals are in rad (hinges) or unit lengths (slides)."""
 
     task: str
-    """push-door, pull-door, push-drawer or pull-drawer"""
+    """name of the task, such as push-door"""
     low: float
-    """smallest amount they were trained on"""
+    """smallest goal they were trained on"""
     high: float
-    """largest amount"""
+    """largest goal"""
     networks: NetworksConfig = field(default_factory=NetworksConfig)
     num_augmentations: int = 1
-    """of a view, mirrored and turned, that the networks are asked about; 1: the view alone"""
+    """copies of a view, mirrored and turned, that predictions are averaged over; 1: the view alone"""
 
     def __post_init__(self) -> None:
         if not 1 <= self.num_augmentations <= MAX_AUGMENTATIONS:
@@ -62,7 +64,7 @@ class Prediction(NamedTuple):
     contact_index: int  # of the point with the highest actionability (on the part, where a mask was given)
     contact: np.ndarray  # [3] float32, that point
     actionability: np.ndarray  # [N] float32 in [0, 1]
-    trajectories: np.ndarray  # [P, 30] float32 from that contact, best first; see geometry.pack_trajectory
+    trajectories: np.ndarray  # [P, 30] float32 from that contact, best first; see trajectory.pack_trajectory
     scores: np.ndarray  # [P] float32 in [0, 1], falling
 
     def save(self, path: Path | str) -> None:
@@ -80,7 +82,7 @@ class Priors:
 
     @property
     def predictor(self) -> TTAPredictor:
-        """The networks as they are to be asked."""
+        """The networks with their test-time augmentation."""
         return TTAPredictor(Networks(self.config.networks), self.config.num_augmentations)
 
     def save(self, path: Path | str) -> None:
@@ -121,26 +123,37 @@ class Priors:
     ) -> Prediction:
         """Actionability of every point, and trajectories at the best of them.
 
-        points: [N, 3] partial cloud, object frame (z up, front towards -x, unit lengths). task: amount > 0, rad or
-        unit lengths. part_mask: [N] bool, restricts the contact to these points. key: which points the networks see
-        where the cloud has more than they were trained with, and the proposals' randomness; consumed. Raises
-        UserError for input that does not fit.
+        points: [N, 3] partial cloud, object frame (z up, front towards -x, unit lengths). task: goal > 0, rad or
+        unit lengths; one outside of the goals in training is warned of. part_mask: [N] bool, restricts the contact to
+        these points. key: which points the networks see where the cloud has more than they were trained with, and the
+        proposals' randomness; consumed. Compiles once per power of two of N. Raises UserError for input that does not
+        fit.
         """
-        require_positive("--proposals", n_proposals)
+        require_positive("n_proposals", n_proposals)
         points = np.asarray(points, np.float32)
         if points.ndim != 2 or points.shape[1] != 3 or not len(points) or not np.isfinite(points).all():
             raise PriorsError(f"points: expected finite [N, 3] coordinates, found shape {points.shape}")
         if not (math.isfinite(task) and task > 0):
-            raise PriorsError(f"task: expected an amount above 0, found {task}")
+            raise PriorsError(f"task: expected a goal above 0, found {task}")
         mask = np.ones(len(points), bool) if part_mask is None else np.asarray(part_mask, bool)
         if mask.shape != (len(points),) or not mask.any():
             raise PriorsError(f"part_mask: expected {len(points)} booleans, one of them true at least")
+        low, high = self.config.low, self.config.high
+        if not low * (1 - 1e-3) <= task <= high * (1 + 1e-3):
+            warnings.warn(f"task {task:.3g}: the priors were trained on {low:.3g} to {high:.3g}", stacklevel=2)
+        padding = _bucket(len(points)) - len(points)
         found = predict(
-            self.predictor, self.params, points, mask, jnp.float32(task), jax.random.key(0) if key is None else key,
-            n_proposals,
-        )  # fmt: skip
-        index, *rest = jax.device_get(found)
-        return Prediction(int(index), points[int(index)], *rest)
+            self.predictor,
+            self.params,
+            np.concatenate([points, np.broadcast_to(points[:1], (padding, 3))]),
+            np.concatenate([mask, np.zeros(padding, bool)]),
+            np.float32(task),
+            key=jax.random.key(0) if key is None else key,
+            count=np.int32(len(points)),
+            n_proposals=n_proposals,
+        )
+        index, actionability, trajectories, scores = jax.device_get(found)
+        return Prediction(int(index), points[int(index)], actionability[: len(points)], trajectories, scores)
 
 
 @partial(jax.jit, static_argnames=("predictor", "n_proposals"))
@@ -149,80 +162,59 @@ def predict(
     params: Params,
     points: jax.Array | np.ndarray,
     part_mask: jax.Array | np.ndarray,
-    task: jax.Array,
+    task: jax.Array | np.ndarray,
+    *,
     key: jax.Array,
+    count: jax.Array | np.ndarray | int,
     n_proposals: int = 100,
 ) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:
     """`Priors.predict` as a function of arrays: contact index [], actionability [N], trajectories [P, 30], scores [P].
 
-    Consumes the key.
+    The first `count` of the N points are the cloud, those behind it padding, which part_mask leaves out. Consumes the
+    key.
     """
     k_points, k_proposals = jax.random.split(key)
-    points = jnp.asarray(points)
-    encoder = predictor.networks.config.encoder
+    points, task = jnp.asarray(points), jnp.asarray(task)
+    encoder = predictor.networks.encoder
     # Random order for the ball queries, and the number of points that training saw; a smaller cloud repeats.
-    order = jax.random.permutation(k_points, len(points))
-    seen = points[jnp.resize(order, (encoder.n_points,))]
-    f = predictor.features(params, seen, group(seen, points, encoder))
+    order = random_order(k_points, len(points), count)
+    seen = points[order[jnp.arange(encoder.num_points) % count]]
+    f = predictor.features(params, seen, encoder.prepare(seen, points))
     actionability = predictor.actionability(params, f, points, task)
     contact = jnp.argmax(jnp.where(part_mask, actionability, -1))
     at = Features(*(x[:, contact] for x in f))
-    trajectories, scores = predictor.propose(params, at, points[contact], task, k_proposals, n_proposals)
+    trajectories, scores = predictor.propose_and_score(params, at, points[contact], task, k_proposals, n_proposals)
     best = jnp.argsort(-scores)
     return contact, actionability, trajectories[best], scores[best]
 
 
-def read_cloud(path: Path) -> np.ndarray:
-    """Points [N, 3] float32 of a .npy or .ply file. Raises PriorsError where it holds none."""
-    try:
-        if path.suffix.lower() == ".npy":
-            points = np.load(path, allow_pickle=False)
-        elif path.suffix.lower() == ".ply":
-            points = np.asarray(trimesh.load(path, process=False).vertices)
-        else:
-            raise PriorsError(f"{path}: expected a .npy or .ply file")
-    except PriorsError:
-        raise
-    except FileNotFoundError:
-        raise PriorsError(f"{path}: no such file") from None
-    except Exception as e:  # whatever the readers raise on damaged bytes
-        raise PriorsError(f"{path}: cannot be read ({summarize_error(e)})") from e
-    if points.dtype.kind not in "fiu" or points.ndim != 2 or points.shape[1] != 3 or not len(points):
-        raise PriorsError(f"{path}: expected numbers [N, 3], found {points.dtype} {points.shape}")
-    points = points.astype(np.float32)
-    if not np.isfinite(points).all():
-        raise PriorsError(f"{path}: holds coordinates that are not finite; remove those points")
-    return points
+def random_order(key: jax.Array, size: int, count: jax.Array | np.ndarray | int) -> jax.Array:
+    """[size] int32, of which the first `count` are those of `jax.random.permutation(key, count)`, without a program for
+    each count: random bits do not depend on how many are drawn, and what lies behind the cloud is sorted last."""
+    order, behind = jnp.arange(size), jnp.arange(size) >= count
+    for number in range(_shuffles(size)):
+        key, own = jax.random.split(key)
+        bits = jnp.where(behind, jnp.uint32(0xFFFFFFFF), jax.random.bits(own, (size,)))
+        shuffled = jax.lax.sort_key_val(bits, order)[1]
+        # As many rounds as a cloud of `count` takes; the largest that makes do with `number` of them.
+        order = jnp.where(count > _largest(number), shuffled, order)
+    return order
 
 
-def read_mask(path: Path, count: int) -> np.ndarray:
-    """[count] bool of a .npy file. Raises PriorsError where it holds something else."""
-    try:
-        mask = np.load(path, allow_pickle=False)
-    except (OSError, EOFError, ValueError) as e:
-        raise PriorsError(f"{path}: cannot be read ({summarize_error(e)}); expected a .npy file of booleans") from e
-    if mask.shape != (count,) or mask.dtype.kind not in "bui" or not mask.any():
-        raise PriorsError(
-            f"{path}: expected {count} booleans, one of them true at least; found {mask.dtype} {mask.shape}"
-        )
-    return mask.astype(bool)
+def _shuffles(size: int) -> int:
+    """Rounds that jax.random.permutation takes."""
+    return math.ceil(3 * math.log(max(1, size)) / math.log(2**32 - 1))
 
 
-def amount(text: str, task: str) -> float:
-    """Rad or unit lengths from `30deg`, `0.5rad` or a plain number of the task's unit. Raises PriorsError."""
-    door = task.endswith("door")
-    number, unit = text, ""
-    for suffix in ("deg", "rad"):
-        if text.endswith(suffix):
-            number, unit = text[: -len(suffix)], suffix
-    try:
-        value = float(number)
-    except ValueError:
-        value = math.nan
-    if not (math.isfinite(value) and value > 0) or (unit and not door):
-        example = "30deg or 0.5rad" if door else "0.3 (unit lengths)"
-        raise PriorsError(f"--task {text}: expected an amount above 0 such as {example}, for the priors are of {task}")
-    return math.radians(value) if unit == "deg" else value
+def _largest(shuffles: int) -> int:
+    """The largest size that takes no more than so many rounds."""
+    size = math.floor((2**32 - 1) ** (shuffles / 3))
+    return size if _shuffles(size + 1) > shuffles else size + 1
+
+
+def _bucket(count: int) -> int:
+    """The size that clouds of so many points are padded to: a power of two, so that few programs serve all."""
+    return max(SMALLEST_BUCKET, 1 << (count - 1).bit_length())
 
 
 def _read_config(path: Path) -> tuple[PriorsConfig, int]:
@@ -238,7 +230,7 @@ def _read_config(path: Path) -> tuple[PriorsConfig, int]:
             found = format_1.renamed(found, {"copies": "num_augmentations"})
             found["networks"] = format_1.networks_config(found["networks"])
         return from_json(PriorsConfig, found), written
-    except (OSError, ValueError, TypeError, KeyError, AttributeError) as e:
+    except (OSError, UserError, ValueError, TypeError, KeyError, AttributeError) as e:
         raise PriorsError(f"{path}: not a config of priors ({summarize_error(e)}); train or export them again") from e
 
 

@@ -12,10 +12,11 @@ from jax import export as jax_export
 
 from vatmart_jax.cli.main import main
 from vatmart_jax.errors import UserError
-from vatmart_jax.perception.networks import Networks, NetworksConfig
+from vatmart_jax.perception.config import NetworksConfig
+from vatmart_jax.perception.networks import Networks
 from vatmart_jax.perception.pointnet2 import PointNet2Config, SetAbstraction
 from vatmart_jax.priors.export import export
-from vatmart_jax.priors.priors import Priors, PriorsConfig, PriorsError, amount, read_cloud, read_mask
+from vatmart_jax.priors.priors import Priors, PriorsConfig, PriorsError
 
 TINY = PointNet2Config(
     n_points=64, levels=(SetAbstraction(16, 0.3, 8, (16,)), SetAbstraction(4, 0.8, 4, (16,))), propagation=((16,),) * 2
@@ -73,8 +74,8 @@ def test_clouds_of_any_size_are_taken(priors: Priors, n: int) -> None:
         ({"points": np.zeros((4, 2))}, r"points: expected finite \[N, 3\] coordinates, found shape \(4, 2\)"),
         ({"points": np.full((4, 3), np.nan)}, "points: expected finite"),
         ({"points": np.zeros((0, 3))}, "points: expected finite"),
-        ({"task": -0.1}, "task: expected an amount above 0, found -0.1"),
-        ({"task": float("nan")}, "task: expected an amount above 0"),
+        ({"task": -0.1}, "task: expected a goal above 0, found -0.1"),
+        ({"task": float("nan")}, "task: expected a goal above 0"),
         ({"part_mask": np.zeros(100, bool)}, "part_mask: expected 100 booleans, one of them true"),
         ({"part_mask": np.ones(3, bool)}, "part_mask: expected 100 booleans"),
     ],
@@ -85,7 +86,7 @@ def test_wrong_input_is_named(priors: Priors, points: np.ndarray, change: dict, 
 
 
 def test_no_proposals_are_refused(priors: Priors, points: np.ndarray) -> None:
-    with pytest.raises(UserError, match="--proposals 0: must be at least 1"):
+    with pytest.raises(UserError, match="n_proposals 0: must be at least 1"):
         priors.predict(points, 0.3, n_proposals=0)
 
 
@@ -167,9 +168,9 @@ def test_exported_stablehlo_computes_what_the_priors_do(priors: Priors, points: 
 
 
 def test_an_export_that_cannot_be_made_writes_nothing(priors: Priors, tmp_path: Path) -> None:
-    with pytest.raises(UserError, match="--format onnx: not one of flax, stablehlo"):
+    with pytest.raises(UserError, match="format onnx: not one of flax, stablehlo"):
         export(priors, tmp_path / "out", ("flax", "onnx"))
-    with pytest.raises(UserError, match="--proposals 0: must be at least 1"):
+    with pytest.raises(UserError, match="n_proposals 0: must be at least 1"):
         export(priors, tmp_path / "out", n_proposals=0)
     assert not (tmp_path / "out").exists()
 
@@ -201,49 +202,6 @@ def test_the_command_predicts_what_the_library_does(priors: Priors, points: np.n
     np.testing.assert_array_equal(np.float32(printed[0]["trajectories"]), found.trajectories)
     with np.load(tmp_path / "found.npz") as saved:
         np.testing.assert_array_equal(saved["scores"], found.scores)
-
-
-@pytest.mark.parametrize(
-    "text, task, value",
-    [
-        ("30deg", "push-door", np.pi / 6),
-        ("0.5rad", "pull-door", 0.5),
-        ("0.5", "push-door", 0.5),
-        ("0.3", "pull-drawer", 0.3),
-    ],
-)
-def test_amounts_are_read_in_the_tasks_unit(text: str, task: str, value: float) -> None:
-    assert amount(text, task) == pytest.approx(value)
-
-
-@pytest.mark.parametrize(
-    "text, task", [("30deg", "push-drawer"), ("-1", "push-door"), ("nan", "push-door"), ("", "push-door")]
-)
-def test_amounts_that_make_no_sense_are_refused(text: str, task: str) -> None:
-    with pytest.raises(PriorsError, match="expected an amount above 0 such as"):
-        amount(text, task)
-
-
-@pytest.mark.parametrize(
-    "name, content, message",
-    [
-        ("cloud.npy", np.zeros((5, 2)), r"expected numbers \[N, 3\], found float64 \(5, 2\)"),
-        ("cloud.npy", np.full((5, 3), np.nan), "not finite"),
-        ("cloud.npy", np.array([{"a": 1}]), "cannot be read"),
-        ("cloud.txt", np.zeros((5, 3)), "expected a .npy or .ply file"),
-    ],
-)
-def test_a_cloud_that_is_none_is_refused(tmp_path: Path, name: str, content: np.ndarray, message: str) -> None:
-    with (tmp_path / name).open("wb") as f:
-        np.save(f, content, allow_pickle=True)
-    with pytest.raises(PriorsError, match=message):
-        read_cloud(tmp_path / name)
-
-
-def test_a_mask_of_another_size_is_refused(tmp_path: Path) -> None:
-    np.save(tmp_path / "mask.npy", np.ones(5, bool))
-    with pytest.raises(PriorsError, match="expected 6 booleans"):
-        read_mask(tmp_path / "mask.npy", 6)
 
 
 def test_the_command_exports_priors_that_load(priors: Priors, tmp_path: Path, capsys) -> None:

@@ -1,0 +1,64 @@
+"""What commands read: point clouds, masks and goals with their units."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import numpy as np
+import trimesh
+
+from vatmart_jax.errors import UserError, summarize_error
+
+
+def read_cloud(path: Path) -> np.ndarray:
+    """Points [N, 3] float32 of a .npy or .ply file. Raises UserError where it holds none."""
+    try:
+        if path.suffix.lower() == ".npy":
+            points = np.load(path, allow_pickle=False)
+        elif path.suffix.lower() == ".ply":
+            points = np.asarray(trimesh.load(path, process=False).vertices)
+        else:
+            raise UserError(f"{path}: expected a .npy or .ply file")
+    except UserError:
+        raise
+    except FileNotFoundError:
+        raise UserError(f"{path}: no such file") from None
+    except Exception as e:  # whatever the readers raise on damaged bytes
+        raise UserError(f"{path}: cannot be read ({summarize_error(e)})") from e
+    if points.dtype.kind not in "fiu" or points.ndim != 2 or points.shape[1] != 3 or not len(points):
+        raise UserError(f"{path}: expected numbers [N, 3], found {points.dtype} {points.shape}")
+    points = points.astype(np.float32)
+    if not np.isfinite(points).all():
+        raise UserError(f"{path}: holds coordinates that are not finite; remove those points")
+    return points
+
+
+def read_mask(path: Path, count: int) -> np.ndarray:
+    """[count] bool of a .npy file. Raises UserError where it holds something else."""
+    try:
+        mask = np.load(path, allow_pickle=False)
+    except (OSError, EOFError, ValueError) as e:
+        raise UserError(f"{path}: cannot be read ({summarize_error(e)}); expected a .npy file of booleans") from e
+    if mask.shape != (count,) or mask.dtype.kind not in "bui" or not mask.any():
+        raise UserError(
+            f"{path}: expected {count} booleans, one of them true at least; found {mask.dtype} {mask.shape}"
+        )
+    return mask.astype(bool)
+
+
+def parse_goal(text: str, task: str) -> float:
+    """Rad or unit lengths from `30deg`, `0.5rad` or a plain number of the task's unit. Raises UserError."""
+    door = task.endswith("door")
+    number, unit = text, ""
+    for suffix in ("deg", "rad"):
+        if text.endswith(suffix):
+            number, unit = text[: -len(suffix)], suffix
+    try:
+        value = float(number)
+    except ValueError:
+        value = math.nan
+    if not (math.isfinite(value) and value > 0) or (unit and not door):
+        example = "30deg or 0.5rad" if door else "0.3 (unit lengths)"
+        raise UserError(f"--task {text}: expected a goal above 0 such as {example}, for the priors are of {task}")
+    return math.radians(value) if unit == "deg" else value
