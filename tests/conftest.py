@@ -12,6 +12,9 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from vatmart_jax.data.banks import HINGE, SLIDE, SceneBank, ViewBank
+from vatmart_jax.host_threads import allow_callbacks
+
+allow_callbacks()  # test modules use JAX before they make a physics
 
 # Compiled programs are kept between runs; in the environment, so that commands which tests start keep them too.
 _CACHE = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "vatmart_jax" / "xla"

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from vatmart_jax.data.part_kinds import HINGE, PART_KINDS, SLIDE
-from vatmart_jax.envs.env import TASKS, Env
+from vatmart_jax.envs import TASKS, make_env
 from vatmart_jax.errors import UserError
 
 
@@ -25,7 +25,9 @@ def test_doors_drawers_and_lids_are_known():
 def test_a_lid_is_in_no_environment_of_doors(cabinets):
     bank, views = cabinets
     kinds = np.where(bank.object_id == "200", "lid", bank.part_kind)
-    env = Env(replace(bank, part_kind=np.where(bank.joint_type == HINGE, kinds, "drawer")), views, TASKS["push-door"])
+    env = make_env(
+        replace(bank, part_kind=np.where(bank.joint_type == HINGE, kinds, "drawer")), views, TASKS["push-door"]
+    )
     assert set(env.bank.object_id) == {"100", "300"}
     with pytest.raises(UserError, match="the data has no door"):
-        Env(replace(bank, part_kind=np.full(len(bank), "lid")), views, TASKS["push-door"])
+        make_env(replace(bank, part_kind=np.full(len(bank), "lid")), views, TASKS["push-door"])

@@ -186,7 +186,7 @@ def test_halving_the_time_step_hardly_moves_the_part(cabinets):
 def test_a_single_cpu_does_not_wait_for_itself() -> None:
     program = """
 import os; os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})
-from vatmart_jax.physics.host_threads import allow_callbacks; allow_callbacks()
+from vatmart_jax.host_threads import allow_callbacks; allow_callbacks()
 import jax, jax.numpy as jnp, numpy as np
 x = jnp.full((512, 512), 1e-3)
 twice = lambda x: jax.pure_callback(lambda x: 2 * np.asarray(x), jax.ShapeDtypeStruct(x.shape, x.dtype), x @ x).sum()

@@ -61,7 +61,7 @@ def test_the_command_writes_an_animated_picture_in_which_things_move(data, traje
     command = [
         sys.executable,
         "-m",
-        "vatmart_jax.cli.main",
+        "vatmart_jax.cli",
         "play",
         "100:drawer",
         "--data",

@@ -15,6 +15,7 @@ from vatmart_jax.envs.start_sampler import StartTable, view_probabilities
 from vatmart_jax.envs.task import Task, get_task
 from vatmart_jax.envs.types import EnvConfig, ViewTable
 from vatmart_jax.errors import UserError
+from vatmart_jax.host_threads import allow_callbacks
 from vatmart_jax.physics import Physics, PhysicsConfig, make_physics
 
 _ALL = "all"
@@ -58,6 +59,7 @@ def make_envs(
 
     Raises UserError where a `required` split has nothing for the task.
     """
+    allow_callbacks()
     task = get_task(task) if isinstance(task, str) else task
     config = config or EnvConfig()
     kind = (scenes.part_kind == task.part_kind) & (scenes.joint_type == task.joint_type)

@@ -81,6 +81,11 @@ def register_task(task: Task) -> Task:
     return task
 
 
+def unregister_task(name: str) -> None:
+    """Forget a task, so that its name can be registered again (in a notebook, after a test)."""
+    _TASKS.unregister(name)
+
+
 def get_task(name: str) -> Task:
     """Raises UserError, which lists the known names, where there is none of this name."""
     return _TASKS.get(name)

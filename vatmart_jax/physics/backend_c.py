@@ -13,9 +13,9 @@ import numpy as np
 from mujoco.batch import Batch
 
 from vatmart_jax.data.banks import SceneBank
+from vatmart_jax.host_threads import allow_callbacks
 from vatmart_jax.physics.config import PhysicsConfig
 from vatmart_jax.physics.gripper import GRIPPERS
-from vatmart_jax.physics.host_threads import allow_callbacks
 from vatmart_jax.physics.scene_model import SCENE_FIELDS, template
 from vatmart_jax.physics.types import PhysicsState, recorded_rollout
 
