@@ -20,7 +20,7 @@ def test_views_of_another_split_are_refused(cabinets) -> None:
     grouped_views = group_views(views, config)
     grouped_views.check_same_views(views)
     others = views.select(np.arange(len(views))[::-1])
-    with pytest.raises(ValueError, match="the grouped views .* are not the environment's"):
+    with pytest.raises(ValueError, match=r"the grouped views .* are not the environment's"):
         grouped_views.check_same_views(others)
     fewer = views.select(np.arange(len(views) - 1))
     with pytest.raises(ValueError, match="are not the environment's"):
