@@ -16,27 +16,14 @@ import mujoco
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from conversion.partnet import ConvertedObject, Joint, ObjectError, Visual
-from conversion.textures import Material
+from conversion.config import MjcfConfig
+from conversion.model import ConvertedObject, Joint, Material, ObjectError, Visual
+from conversion.palette import BODY, HANDLE, PARTS
 
 VISUAL_GROUP, COLLISION_GROUP = 2, 3
-BODY_RGBA, HANDLE_RGBA = "0.80 0.78 0.74 1", "0.25 0.25 0.28 1"
-PART_RGBA = ("0.62 0.72 0.84 1", "0.86 0.70 0.55 1", "0.66 0.80 0.62 1", "0.82 0.64 0.72 1", "0.74 0.70 0.86 1")
 
 
-@dataclass(frozen=True)
-class MjcfConfig:
-    density: float = 300.0
-    """Of the hulls, kg per cubic unit length: what links weigh."""
-    friction: float = 1.0
-    """Sliding friction of the hulls, towards whatever touches them."""
-    joint_damping: float = 1.0
-    """Damping of every joint, N m s/rad or N s per unit length."""
-    joint_friction: float = 0.05
-    """Friction loss of every joint, N m or N."""
-
-
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Mjcf:
     xml: str
     assets: dict[str, bytes]  # file name below assets/ -> content
@@ -61,7 +48,7 @@ def to_mjcf(converted: ConvertedObject, config: MjcfConfig) -> Mjcf:
 
     Geoms of the object never collide with each other: hulls of neighbours touch, and MuJoCo does not filter pairs
     whose parent is welded to the world. Weight is compensated: annotations know no springs and no latches, without
-    which flaps and lids would fall open. Keyframes `closed` and `open` set doors and drawers, all else at 0.
+    which flaps and lids would fall open. Keyframes `closed` and `open` set doors, drawers and lids, all else at 0.
     """
     obj = converted.obj
     root = Element("mujoco", model=f"{obj.category}_{obj.id}")
@@ -86,7 +73,7 @@ def to_mjcf(converted: ConvertedObject, config: MjcfConfig) -> Mjcf:
     materials: dict[Material, str] = {}
     textures: dict[bytes, str] = {}
     geom_names: Counter[str] = Counter()
-    colors = {p.link: PART_RGBA[i % len(PART_RGBA)] for i, p in enumerate(converted.parts)}
+    colors = {p.link: _rgba(PARTS[i % len(PARTS)]) for i, p in enumerate(converted.parts)}
 
     def unique(name: str) -> str:
         geom_names[name] += 1
@@ -118,7 +105,7 @@ def to_mjcf(converted: ConvertedObject, config: MjcfConfig) -> Mjcf:
                 _joint(body, joint)
         if link.semantics:
             SubElement(custom, "text", name=f"semantics:{name}", data=link.semantics)
-        color = colors.get(obj.group_root(name), BODY_RGBA)
+        color = colors.get(obj.group_root(name), _rgba(BODY))
         for v in link.visuals:
             for vertices, faces, uv, material in _pieces(v):
                 mesh = f"visual_{len(assets)}"
@@ -126,7 +113,7 @@ def to_mjcf(converted: ConvertedObject, config: MjcfConfig) -> Mjcf:
                 SubElement(asset, "mesh", name=mesh, file=f"{mesh}.obj", inertia="shell")
                 geom = SubElement(body, "geom", {"class": "visual"}, name=unique(f"{name}/{v.name}"), mesh=mesh)
                 if material is None:
-                    geom.set("rgba", HANDLE_RGBA if v.is_handle else color)
+                    geom.set("rgba", _rgba(HANDLE) if v.is_handle else color)
                 else:
                     geom.set("material", named(material))
     for group, hulls in converted.hulls.items():
@@ -145,7 +132,7 @@ def to_mjcf(converted: ConvertedObject, config: MjcfConfig) -> Mjcf:
         if not hulls and group != obj.root:  # MuJoCo wants mass on whatever moves
             SubElement(bodies[group], "inertial", pos="0 0 0", mass="0.001", diaginertia="1e-6 1e-6 1e-6")
     ElementTree.indent(root)
-    draft = Mjcf(ElementTree.tostring(root, encoding="unicode"), assets)
+    draft = Mjcf(xml=ElementTree.tostring(root, encoding="unicode"), assets=assets)
     if not converted.parts:
         return draft
     # The order of qpos is MuJoCo's, so keyframes need the compiled model.
@@ -157,10 +144,14 @@ def to_mjcf(converted: ConvertedObject, config: MjcfConfig) -> Mjcf:
             qpos[model.joint(joint.name).qposadr[0]] = np.clip(0.0, joint.lower, joint.upper)
     for key, opening in (("closed", 0.0), ("open", 1.0)):
         for part in converted.parts:
-            qpos[model.joint(part.joint).qposadr[0]] = part.closed + part.sign * part.width * opening
+            qpos[model.joint(part.joint).qposadr[0]] = part.closed + part.sign * part.joint_range * opening
         SubElement(keyframe, "key", name=key, qpos=_text(qpos))
     ElementTree.indent(root)
-    return Mjcf(ElementTree.tostring(root, encoding="unicode"), assets)
+    return Mjcf(xml=ElementTree.tostring(root, encoding="unicode"), assets=assets)
+
+
+def _rgba(color: tuple[float, float, float]) -> str:
+    return " ".join(f"{x:.2f}" for x in color) + " 1"
 
 
 def _body_name(link: str) -> str:
@@ -199,13 +190,14 @@ def _home(converted: ConvertedObject, group: str) -> tuple[str, np.ndarray]:
 
 def _pieces(visual: Visual) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray | None, Material | None]]:
     """Vertices, faces, texture coordinates [m, 3, 2] of their corners, and material: MuJoCo has one per geom."""
-    if visual.skin is None:
+    of_faces = visual.materials
+    if of_faces is None:
         yield visual.vertices, visual.faces, None, None
         return
-    for i in np.unique(visual.skin.material):
-        rows, material = visual.skin.material == i, visual.skin.materials[i]
+    for i in np.unique(of_faces.index):
+        rows, material = of_faces.index == i, of_faces.materials[i]
         used, faces = np.unique(visual.faces[rows], return_inverse=True)
-        uv = visual.skin.uv[rows] if material is not None and material.png is not None else None
+        uv = of_faces.uv[rows] if material is not None and material.png is not None else None
         yield visual.vertices[used], faces.reshape(-1, 3), uv, material
 
 

@@ -1,24 +1,29 @@
-"""Doors and drawers of converted objects -> Scenes, each one moving part with everything else static: SceneBank."""
+"""Moving parts of converted objects -> Scenes, each one moving part with everything else static: SceneBank."""
 
 from __future__ import annotations
 
 import zlib
-from collections.abc import Iterator, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import product
+from typing import Any
 
 import numpy as np
 from scipy.spatial import ConvexHull
 from scipy.spatial.transform import Rotation
 
-from conversion.partnet import ConvertedObject, Hull, ObjectError, Part
-from vatmart_jax.data.banks import HINGE, SLIDE, SceneBank
+from conversion.model import ConvertedObject, ConvexShape, ObjectError, Part
+from vatmart_jax.data.banks import SceneBank
+from vatmart_jax.data.part_kinds import PART_KINDS
 
 SWEEP = np.linspace(0.0, 1.0, 9)  # shares of a part's range at which neighbours must leave it room
 ROOM = 2e-3  # unit lengths; hulls may overlap this much more than with everything closed
 
 
-@dataclass(frozen=True)
+InstanceRow = tuple[int, np.ndarray, np.ndarray, bool]  # shape, position [3], quaternion [4] wxyz, is a handle's
+
+
+@dataclass(frozen=True, kw_only=True)
 class Placement:
     """One link group of a Scene."""
 
@@ -31,81 +36,91 @@ def rng_of(seed: int, *key: str | int) -> np.random.Generator:
     return np.random.default_rng([seed, *(zlib.crc32(str(k).encode()) for k in key)])
 
 
-def scene_bank(objects: Sequence[ConvertedObject], variants: int, collision: str, seed: int) -> SceneBank:
-    """One Scene per object, door or drawer, and variant. collision: "hull" or "box".
+@dataclass(frozen=True, kw_only=True)
+class SceneSpec:
+    """One Scene to be: which part of which object moves, and how the object's other joints stand."""
+
+    converted: ConvertedObject
+    part: Part
+    variant: int
+    values: Mapping[str, float]  # URDF values, by joint name, of every joint but the part's own
+
+
+def scene_specs(converted: ConvertedObject, variants: int, seed: int) -> list[SceneSpec]:
+    """The Scenes of an object, in the bank's order: one per moving part and variant.
 
     Variant 0 has all other parts closed. Each further one has some of the other joints at sampled values
-    (`other_values`); one that equals an earlier variant is left out. Objects without parts give no Scene. Raises
-    ObjectError where a box bank is asked of objects whose collision geometry is hulls.
+    (`other_values`); one that equals an earlier variant is left out.
     """
-    shapes: list[Hull] = []
-    scenes, static, moving = [], [], []  # static and moving: rows of instances per Scene
-    for converted in objects:
-        first = len(shapes)
-        shapes += [h for hulls in converted.hulls.values() for h in hulls]
-        if collision == "box" and any(h.box_pose is None for h in shapes[first:]):
-            raise ObjectError(f"{converted.obj.id}: its collision geometry is hulls; convert with --collision box")
-        for part, variant, values in variants_of(converted, variants, seed):
-            rest, own, pose = placements(converted, part, values)
-            static.append(instances(converted, rest, collision, first))
-            moving.append(instances(converted, own, collision, first))
-            joint = converted.obj.joints[part.link]
-            scenes.append({
-                "object_id": converted.obj.id,
-                "category": converted.obj.category,
-                "split": converted.split,
-                "part": part.link,
-                "joint": part.joint,
-                "variant": variant,
-                "joint_type": SLIDE if part.kind == "drawer" else HINGE,
-                "part_pos": pose[:3, 3],
-                "part_quat": _quat(pose),
-                "axis": part.sign * joint.axis,
-                "width": part.width,
-                "urdf_closed": part.closed,
-                "urdf_sign": part.sign,
-            })  # fmt: skip
-    table = [row for rows in (*static, *moving) for row in rows]
-    column = lambda name, dtype, *shape: np.array([s[name] for s in scenes], dtype).reshape(-1, *shape)
-    vertices = [h.vertices for h in shapes] if collision == "hull" else []
-    sizes = [h.box_size for h in shapes] if collision == "box" else []
-    bank = SceneBank(
-        collision=collision,
-        hull_vertices=np.concatenate([np.zeros((0, 3)), *vertices]).astype(np.float32),
-        hull_start=np.cumsum([0] + [len(v) for v in vertices]).astype(np.int32),
-        box_size=np.array(sizes, np.float32).reshape(-1, 3),
-        instance_shape=np.array([r[0] for r in table], np.int32),
-        instance_pos=np.array([r[1] for r in table], float).reshape(-1, 3),
-        instance_quat=np.array([r[2] for r in table], float).reshape(-1, 4),
-        instance_handle=np.array([r[3] for r in table], bool),
-        static_start=np.cumsum([0] + [len(r) for r in static]).astype(np.int32),
-        part_start=(sum(map(len, static)) + np.cumsum([0] + [len(r) for r in moving])).astype(np.int32),
-        object_id=column("object_id", np.str_),
-        category=column("category", np.str_),
-        split=column("split", np.str_),
-        part=column("part", np.str_),
-        joint=column("joint", np.str_),
-        variant=column("variant", np.int32),
-        joint_type=column("joint_type", np.int32),
-        part_pos=column("part_pos", np.float64, 3),
-        part_quat=column("part_quat", np.float64, 4),
-        axis=column("axis", np.float64, 3),
-        width=column("width", np.float64),
-        urdf_closed=column("urdf_closed", np.float64),
-        urdf_sign=column("urdf_sign", np.float64),
-    )
-    return bank.select(np.arange(len(bank)))
-
-
-def variants_of(converted: ConvertedObject, variants: int, seed: int) -> Iterator[tuple[Part, int, dict[str, float]]]:
-    """(part, variant, values of the other joints) of every Scene of an object, in the bank's order."""
+    out = []
     for part in converted.parts:
         seen: list[dict[str, float]] = []
         for variant in range(variants):
             values = other_values(converted, part, variant, seed)
             if values not in seen:
                 seen.append(values)
-                yield part, variant, values
+                out.append(SceneSpec(converted=converted, part=part, variant=variant, values=values))
+    return out
+
+
+def scene_bank(specs: Sequence[SceneSpec], collision: str) -> SceneBank:
+    """The Scenes of `specs`, those of one object in a row. collision: "hull" or "box".
+
+    Raises ObjectError where a box bank is asked of objects whose collision geometry is hulls.
+    """
+    shapes: list[ConvexShape] = []
+    scenes, static, moving = [], [], []  # static and moving: rows of instances per Scene
+    first, last = 0, None
+    for spec in specs:
+        converted, part = spec.converted, spec.part
+        if converted is not last:
+            first, last = len(shapes), converted
+            shapes += [shape for group in converted.hulls.values() for shape in group]
+            if collision == "box" and any(shape.box_pose is None for shape in shapes[first:]):
+                raise ObjectError(f"{converted.obj.id}: its collision geometry is hulls; convert with --collision box")
+        rest, own, pose = placements(spec)
+        static.append(instances(converted, rest, collision, first))
+        moving.append(instances(converted, own, collision, first))
+        scenes.append({
+            "object_id": converted.obj.id,
+            "category": converted.obj.category,
+            "split": converted.split,
+            "part": part.link,
+            "joint": part.joint,
+            "variant": spec.variant,
+            "part_kind": part.kind,
+            "joint_type": PART_KINDS.get(part.kind).joint_type,
+            "part_pos": pose[:3, 3],
+            "part_quat": _quat(pose),
+            "axis": part.sign * converted.obj.joints[part.link].axis,
+            "joint_range": part.joint_range,
+            "urdf_closed": part.closed,
+            "urdf_sign": part.sign,
+        })  # fmt: skip
+    columns = {name: _column(scenes, name, dtype, *shape) for name, dtype, *shape in _COLUMNS}
+    vertices = [shape.vertices for shape in shapes] if collision == "hull" else []
+    sizes = [shape.box_size for shape in shapes] if collision == "box" else []
+    bank = SceneBank(
+        collision=collision,
+        hull_vertices=np.concatenate([np.zeros((0, 3)), *vertices]).astype(np.float32),
+        hull_start=np.cumsum([0] + [len(v) for v in vertices]).astype(np.int32),
+        box_size=np.array(sizes, np.float32).reshape(-1, 3),
+        **instance_table(static, moving),
+        **columns,
+    )
+    return bank.select(np.arange(len(bank)))
+
+
+_COLUMNS = (
+    ("object_id", np.str_), ("category", np.str_), ("split", np.str_), ("part", np.str_), ("joint", np.str_),
+    ("variant", np.int32), ("part_kind", np.str_), ("joint_type", np.int32), ("part_pos", np.float64, 3),
+    ("part_quat", np.float64, 4), ("axis", np.float64, 3), ("joint_range", np.float64), ("urdf_closed", np.float64),
+    ("urdf_sign", np.float64),
+)  # fmt: skip
+
+
+def _column(scenes: Sequence[Mapping[str, Any]], name: str, dtype: Any, *shape: int) -> np.ndarray:
+    return np.array([scene[name] for scene in scenes], dtype).reshape(-1, *shape)
 
 
 def other_values(converted: ConvertedObject, part: Part, variant: int, seed: int) -> dict[str, float]:
@@ -133,23 +148,19 @@ def other_values(converted: ConvertedObject, part: Part, variant: int, seed: int
     return values
 
 
-def placements(
-    converted: ConvertedObject, part: Part, values: dict[str, float]
-) -> tuple[list[Placement], list[Placement], np.ndarray]:
+def placements(spec: SceneSpec) -> tuple[list[Placement], list[Placement], np.ndarray]:
     """What is static and what moves with the part, and the part's pose [4, 4] when closed, object frame."""
-    obj = converted.obj
-    poses = obj.link_poses(values | {part.joint: part.closed})
+    obj, part = spec.converted.obj, spec.part
+    poses = obj.link_poses({**spec.values, part.joint: part.closed})
     own = obj.subtree(part.link)
     pose = poses[part.link]
     inverse = np.linalg.inv(pose)
-    rest = [Placement(g, poses[g]) for g in obj.groups if g not in own]
-    return rest, [Placement(g, inverse @ poses[g]) for g in obj.groups if g in own], pose
+    rest = [Placement(group=g, pose=poses[g]) for g in obj.groups if g not in own]
+    return rest, [Placement(group=g, pose=inverse @ poses[g]) for g in obj.groups if g in own], pose
 
 
-def instances(
-    converted: ConvertedObject, groups: list[Placement], collision: str, first: int
-) -> list[tuple[int, np.ndarray, np.ndarray, bool]]:
-    """(shape, pos [3], quat [4] wxyz, is a handle's) of every hull or box of these groups, in the bank's order.
+def instances(converted: ConvertedObject, groups: list[Placement], collision: str, first: int) -> list[InstanceRow]:
+    """One row per hull or box of these groups, in the bank's order.
 
     first: the index of the object's first shape.
     """
@@ -162,13 +173,31 @@ def instances(
     return out
 
 
+def instance_table(
+    static: Sequence[Sequence[InstanceRow]], part: Sequence[Sequence[InstanceRow]]
+) -> dict[str, np.ndarray]:
+    """The instance table of a SceneBank from its rows per Scene: statics of all Scenes first, then parts."""
+    rows = [row for table in (static, part) for scene in table for row in scene]
+    first = sum(map(len, static))
+    return {
+        "instance_shape": np.array([r[0] for r in rows], np.int32),
+        "instance_pos": np.array([r[1] for r in rows], np.float64).reshape(-1, 3),
+        "instance_quat": np.array([r[2] for r in rows], np.float64).reshape(-1, 4),
+        "instance_handle": np.array([r[3] for r in rows], bool),
+        "static_start": np.cumsum([0] + [len(r) for r in static]).astype(np.int32),
+        "part_start": (first + np.cumsum([0] + [len(r) for r in part])).astype(np.int32),
+    }
+
+
 class _Room:
     """The room that a part needs to move: how much its hulls overlap the rest of the object on the way."""
 
     def __init__(self, converted: ConvertedObject, part: Part, closed: dict[str, float]):
         self.converted, self.part = converted, part
         self.own = set(converted.obj.subtree(part.link))
-        self.convex = {g: [_Convex.of(h.vertices) for h in hulls] for g, hulls in converted.hulls.items() if hulls}
+        self.convex = {
+            g: [_Convex.from_vertices(h.vertices) for h in hulls] for g, hulls in converted.hulls.items() if hulls
+        }
         self.closed = [self._moved(closed, share, set(self.convex)) for share in SWEEP]
 
     def leaves(self, values: dict[str, float], link: str) -> bool:
@@ -185,11 +214,11 @@ class _Room:
 
     def _moved(self, values: dict[str, float], share: float, groups: set[str]) -> dict[str, list[_Convex]]:
         part = self.part
-        poses = self.converted.obj.link_poses(values | {part.joint: part.closed + part.sign * share * part.width})
+        poses = self.converted.obj.link_poses(values | {part.joint: part.closed + part.sign * share * part.joint_range})
         return {g: [c.moved(poses[g]) for c in self.convex[g]] for g in groups}
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class _Convex:
     vertices: np.ndarray  # [n, 3]
     normals: np.ndarray  # [f, 3] unit, one per distinct face plane
@@ -197,13 +226,14 @@ class _Convex:
     high: np.ndarray
 
     @classmethod
-    def of(cls, vertices: np.ndarray) -> _Convex:
+    def from_vertices(cls, vertices: np.ndarray) -> _Convex:
         normals = np.unique(ConvexHull(vertices).equations[:, :3].round(9), axis=0)
-        return cls(vertices, normals, vertices.min(0), vertices.max(0))
+        return cls(vertices=vertices, normals=normals, low=vertices.min(0), high=vertices.max(0))
 
     def moved(self, pose: np.ndarray) -> _Convex:
         vertices = self.vertices @ pose[:3, :3].T + pose[:3, 3]
-        return _Convex(vertices, self.normals @ pose[:3, :3].T, vertices.min(0), vertices.max(0))
+        normals = self.normals @ pose[:3, :3].T
+        return _Convex(vertices=vertices, normals=normals, low=vertices.min(0), high=vertices.max(0))
 
     def overlap(self, other: _Convex) -> float:
         """Smallest translation along a face normal that parts the two: never less than their penetration."""

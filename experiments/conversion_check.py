@@ -19,7 +19,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -31,11 +31,14 @@ import yourdfpy
 from scipy.spatial import ConvexHull
 from trimesh.ray.ray_pyembree import RayMeshIntersector
 
-from conversion.convert import URDF_NAMES, ConvertConfig, convert
+from conversion.config import ConvertConfig, ViewConfig
+from conversion.convert import convert
 from conversion.mjcf import VISUAL_GROUP
-from conversion.partnet import ConvertedObject, Visual
-from conversion.scenes import other_values
-from conversion.views import DISTANCE, views
+from conversion.model import ConvertedObject, Visual
+from conversion.readers.partnet_mobility import URDF_NAMES
+from conversion.render_views import DISTANCE, render_views
+from conversion.scenes import scene_specs
+from vatmart_jax.camera import Camera
 from vatmart_jax.data.banks import SceneBank
 
 RESULTS = Path(__file__).parent / "results" / "conversion.json"
@@ -157,7 +160,7 @@ def fidelity(check: Check) -> dict[str, Any]:
         static = next(iter(r["groups"]), None)
         moving += [(r["id"], k, g) for k, g in r["groups"].items() if k in parts]
         rest += [(r["id"], k, g) for k, g in r["groups"].items() if k == static and k not in parts]
-        handles += [(r["id"], h["link"], h["hulls"]) for h in r["handles"] if h["visual"]]
+        handles += [(r["id"], h["link"], h["clear_in_hulls"]) for h in r["handles"] if h["clear_in_mesh"]]
     lost = [f"{i} {link}" for i, link, kept in handles if not kept]
     of_handles = {"passable": len(handles), "kept": sum(kept for *_, kept in handles), "lost": lost}
     return _gaps_and_phantoms(moving, rest) | {"handles": of_handles}
@@ -210,7 +213,10 @@ def _by_sight(visuals: list[Visual], hulls: list[np.ndarray], rng: np.random.Gen
     seen = np.concatenate([seen, mesh.vertices[:: max(1, len(mesh.vertices) // 1000)]])
     seen = seen[_visible(mesh, seen, rng)]
     planes = [ConvexHull(h).equations for h in hulls]
-    depth = lambda p: np.min([(p @ e[:, :3].T + e[:, 3]).max(axis=1) for e in planes], axis=0)
+
+    def depth(p: np.ndarray) -> np.ndarray:
+        return np.min([(p @ e[:, :3].T + e[:, 3]).max(axis=1) for e in planes], axis=0)
+
     out = seen[depth(seen) > 1e-4]
     gap = trimesh.proximity.closest_point(skin, out)[1] if len(out) else np.zeros(1)
     on = trimesh.sample.sample_surface(skin, 3000, seed=seed)[0]
@@ -327,7 +333,8 @@ def _control(processes: int) -> float:
 def again(check: Check) -> dict[str, Any]:
     """5: a second run of the whole set, which finds everything up to date (same flags as the first)."""
     config = json.loads((check.out / "convert.json").read_text())["config"]
-    changed = {k: v for k, v in config.items() if v != getattr(ConvertConfig(), k)}
+    default = _flat(asdict(ConvertConfig()))
+    changed = {k: v for k, v in _flat(config).items() if v != default[k]}
     flags = [w for k, v in changed.items() for w in ((f"--{k.replace('_', '-')}",) if v is True else
              (f"--{k.replace('_', '-')}", str(v)))]  # fmt: skip
     before = {p: p.stat().st_mtime_ns for p in check.out.glob("*/*")}
@@ -336,9 +343,17 @@ def again(check: Check) -> dict[str, Any]:
     return {"seconds": round(seconds, 2), "nothing_written": same}
 
 
+def _flat(config: dict[str, Any]) -> dict[str, Any]:
+    """Flags and their values of a nested config."""
+    out = {}
+    for name, value in config.items():
+        out |= value if isinstance(value, dict) else {name: value}
+    return out
+
+
 def _vatmart(*words: str | Path) -> float:
     """Seconds that the command takes."""
-    command = [sys.executable, "-m", "vatmart_jax.cli", *map(str, words)]
+    command = [sys.executable, "-m", "vatmart_jax.cli.main", *map(str, words)]
     start = time.monotonic()
     subprocess.run(command, check=True, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
     return time.monotonic() - start
@@ -348,32 +363,24 @@ def rendering(check: Check, scenes: int = 48, per_scene: int = 2, points: int = 
     """6: views per second on two processes; depth and mask by MuJoCo's rays; distance to the visual surface."""
     bank = SceneBank.load(check.out / "scenes.npz")
     config = json.loads((check.out / "convert.json").read_text())["config"]
-    chosen = np.arange(len(bank))[:: max(1, len(bank) // scenes)]
-    chosen = chosen[np.isin(bank.object_id[chosen], check.only)] if check.only else chosen
-    some = bank.select(chosen)
-    loaded = {name: ConvertedObject.load(check.out / name) for name in sorted(set(some.object_id.tolist()))}
-    # Views are checked against the Scenes' own instances, which merging may have replaced: links as they are.
-    from conversion.scenes import scene_bank
-
-    links = scene_bank(list(loaded.values()), config["variants"], config["collision"], config["seed"])
-    key = lambda b, s: (str(b.object_id[s]), str(b.part[s]), int(b.variant[s]))
-    wanted = {key(some, s) for s in range(len(some))}
-    links = links.select(np.array([s for s in range(len(links)) if key(links, s) in wanted], int))
+    names = sorted(set(bank.object_id.tolist()) & set(check.only or bank.object_id.tolist()))
+    names = names[:: max(1, len(bank) // scenes)]
+    loaded = [ConvertedObject.load(check.out / name) for name in names]
+    specs = [spec for converted in loaded for spec in scene_specs(converted, config["variants"], config["seed"])]
+    view = ViewConfig(views=per_scene, train_factor=1, points=points)
     start = time.monotonic()
-    found, without = views(list(loaded.values()), links, per_scene, points, 128, config["seed"], jobs=2)
+    found, without = render_views(loaded, config["variants"], config["seed"], view, jobs=2)
     seconds = time.monotonic() - start
     agree, depth, away = [], [], []
     rng = np.random.default_rng(check.seed)
     for v in range(0, len(found), per_scene):
-        s = int(found.scene[v])
-        converted = loaded[str(links.object_id[s])]
-        part = next(p for p in converted.parts if p.link == links.part[s])
-        closed = other_values(converted, part, int(links.variant[s]), config["seed"]) | {part.joint: part.closed}
-        values = closed | {part.joint: part.closed + part.sign * float(found.q[v])}
+        spec = specs[int(found.scene[v])]
+        converted, part = spec.converted, spec.part
+        closed = {**spec.values, part.joint: part.closed}
+        values = closed | {part.joint: part.closed + part.sign * float(found.joint_pos[v])}
         corners = _surface(converted, closed).vertices
-        turn = trimesh.transformations.rotation_matrix(found.azimuth[v], [0, 0, 1])[:3, :3]
-        back = turn @ [-np.cos(found.elevation[v]), 0, np.sin(found.elevation[v])]
-        eye = (corners.min(axis=0) + corners.max(axis=0)) / 2 + DISTANCE * back
+        centre = (corners.min(axis=0) + corners.max(axis=0)) / 2
+        eye = Camera.looking_at(centre, found.azimuth[v], found.elevation[v], DISTANCE).position
         some_points = rng.choice(len(found.points[v]), rays)
         cloud = found.points[v][some_points].astype(float)
         distance, moves = _cast(check.out / converted.obj.id / "model.xml", converted, part.link, values, eye, cloud)
@@ -480,7 +487,7 @@ def fuzz(check: Check, folders: range = range(200)) -> dict[str, Any]:
             mutate(folder, np.random.default_rng((check.seed, i)))
         before = _listing(root)
         start = time.monotonic()
-        result = convert([root / "src"], root / "out", ConvertConfig(views=0, time_limit=60), jobs=2)
+        result = convert([root / "src"], root / "out", ConvertConfig(view=ViewConfig(views=0), time_limit=60), jobs=2)
         seconds = time.monotonic() - start
         after = {k: v for k, v in _listing(root).items() if not k.startswith("out/")}
         unclear = [f for f in result.failed if "\n" in f["reason"] or len(f["reason"]) > 300 or _crash(f["reason"])]

@@ -20,8 +20,10 @@ import numpy as np
 import trimesh
 import tyro
 
-from conversion.handles import handles
-from conversion.partnet import ObjectError, PartNetObject, parts, read_object
+from conversion.finger_clearance import check_finger_clearance
+from conversion.model import ArticulatedObject, ObjectError
+from conversion.part_detection import detect_parts
+from conversion.readers import read_object
 
 HERE = Path(__file__).parent
 PAPER = ("StorageFurniture", "Refrigerator", "Microwave", "Door", "Safe", "Table", "WashingMachine")
@@ -32,13 +34,16 @@ def measure(folder: Path) -> tuple[Measured, list[np.ndarray]]:
     """What the figure shows, of all objects of the paper's categories with a door or drawer; their occupied cells."""
     out: Measured = {}
     cells = []
-    add = lambda key, value: out.setdefault(key, []).append(float(value))
+
+    def add(key: str, value: float) -> None:
+        out.setdefault(key, []).append(float(value))
+
     for path in sorted(p for p in folder.iterdir() if (p / "mobility.urdf").is_file()):
         try:
             obj = read_object(path)
         except ObjectError:
             continue
-        found, left_out = parts(obj)
+        found, left_out = detect_parts(obj)
         if obj.category not in PAPER or not found:
             continue
         add("doors and drawers per object", len(found))
@@ -52,12 +57,12 @@ def measure(folder: Path) -> tuple[Measured, list[np.ndarray]]:
             add("middle side of a part", extent[1])
             add("thinnest side of a part", extent[0])
             add("range of doors, degrees" if part.kind == "door" else "range of drawers, unit lengths",
-                np.rad2deg(part.width) if part.kind == "door" else part.width)  # fmt: skip
+                np.rad2deg(part.joint_range) if part.kind == "door" else part.joint_range)  # fmt: skip
             own = [v for v in visuals if v.is_handle]
             if part.kind == "door" and len(own) < len(visuals):
                 add("thickness of a door", _thickness(np.concatenate(
                     [v.vertices[v.faces].reshape(-1, 3) for v in visuals if not v.is_handle])))  # fmt: skip
-            fingers = any(h.visual for h in handles(obj, part, []))
+            fingers = any(h.clear_in_mesh for h in check_finger_clearance(obj, part, []))
             add("handle: none, knob or lip, bar", 0 if not own else 2 if fingers else 1)
             if own:
                 size = np.sort(np.ptp(np.concatenate([v.vertices for v in own]), axis=0))
@@ -77,7 +82,7 @@ def _thickness(corners: np.ndarray) -> float:
     return float(np.median([np.ptp(hits[rays == ray, across]) for ray in np.unique(rays)]))
 
 
-def _cells(obj: PartNetObject) -> np.ndarray:
+def _cells(obj: ArticulatedObject) -> np.ndarray:
     """[n, 3] int, distinct, of a centred object at joint values 0."""
     poses = obj.link_poses()
     corners = np.concatenate([

@@ -4,7 +4,7 @@
 
 hulls: one hull per semantic leaf, concave leaves grown from their flat patches, merged to the budget (the default).
 coacd_leaf: CoACD on the concave leaves, merged to the budget (`--decomposer coacd`). coacd_link: CoACD on the whole
-link's mesh, which knows nothing of leaves. Seconds are of one core. Gap, phantom: see conversion/decompose.py.
+link's mesh, which knows nothing of leaves. Seconds are of one core. Gap, phantom: see conversion/fidelity.py.
 """
 
 from __future__ import annotations
@@ -18,8 +18,13 @@ from pathlib import Path
 import numpy as np
 import tyro
 
-from conversion.decompose import DecomposeConfig, Surface, decompose, fidelity
-from conversion.partnet import Hull, parts, read_object
+from conversion.config import DecomposeConfig
+from conversion.decompose import decompose
+from conversion.fidelity import measure_fidelity
+from conversion.model import ConvexShape
+from conversion.part_detection import detect_parts
+from conversion.readers import read_object
+from conversion.surface import Surface
 
 RESULTS = Path(__file__).parent / "results" / "conversion-study.json"
 CONFIG = DecomposeConfig()
@@ -31,15 +36,15 @@ LINKS = (
 )  # fmt: skip
 
 
-def hulls(surface: Surface, budget: int) -> list[Hull]:
+def hulls(surface: Surface, budget: int) -> list[ConvexShape]:
     return decompose(surface, budget, CONFIG)
 
 
-def coacd_leaf(surface: Surface, budget: int) -> list[Hull]:
+def coacd_leaf(surface: Surface, budget: int) -> list[ConvexShape]:
     return decompose(surface, budget, replace(CONFIG, decomposer="coacd"))
 
 
-def coacd_link(surface: Surface, budget: int) -> list[Hull]:
+def coacd_link(surface: Surface, budget: int) -> list[ConvexShape]:
     import coacd
 
     coacd.set_log_level("error")
@@ -58,25 +63,25 @@ def coacd_link(surface: Surface, budget: int) -> list[Hull]:
         resolution=1000,
         seed=0,
     )
-    return [Hull(np.asarray(v, np.float64), False) for v, _ in found]
+    return [ConvexShape(vertices=np.asarray(v, np.float64), is_handle=False) for v, _ in found]
 
 
 def main(src: Path, results: Path = RESULTS, links: tuple[str, ...] = ()) -> None:
     """links: ids to do again; all if empty."""
     table = json.loads(results.read_text()) if results.is_file() else {}
-    methods: tuple[Callable[[Surface, int], list[Hull]], ...] = (hulls, coacd_leaf, coacd_link)
+    methods: tuple[Callable[[Surface, int], list[ConvexShape]], ...] = (hulls, coacd_leaf, coacd_link)
     for name, what in LINKS:
         if links and name not in links:
             continue
         obj = read_object(src / name)
-        root = obj.root if what == "static" else parts(obj)[0][0].link
+        root = obj.root if what == "static" else detect_parts(obj)[0][0].link
         visuals = obj.group_visuals(root)
         row = {"category": obj.category, "link": root, "leaves": len(visuals)}
         for method in methods:
             start = time.process_time()
             found = method(Surface(visuals), 32 if what == "static" else 16)
             seconds = time.process_time() - start
-            match = asdict(fidelity(Surface(visuals, seed=1), found))
+            match = asdict(measure_fidelity(Surface(visuals, seed=1), found))
             row[method.__name__] = {"seconds": round(seconds, 2), "hulls": len(found)} | {
                 k: round(v, 4) for k, v in match.items()
             }

@@ -19,7 +19,7 @@ from vatmart_jax.atomic_io import write_json
 from vatmart_jax.data.dataset import Data
 from vatmart_jax.errors import UserError, require_one_of, require_positive
 from vatmart_jax.evaluation.metrics import wilson_interval
-from vatmart_jax.physics.types import default_impl
+from vatmart_jax.physics import default_impl
 from vatmart_jax.pipeline.presets import PRESETS
 from vatmart_jax.pipeline.run_dir import read_config, read_metrics
 from vatmart_jax.reporting import ConsoleReporter

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import tyro
 
 from vatmart_jax.data.banks import SceneBank, ViewBank
-from vatmart_jax.envs.env import ACTION, TASKS, Env, EnvConfig
+from vatmart_jax.envs import EnvConfig, make_env
 from vatmart_jax.envs.scripted_policy import scripted_action
 from vatmart_jax.trajectory import WAYPOINTS
 
@@ -32,9 +32,9 @@ class Example:
 
 def main(args: Example) -> None:
     bank, views = SceneBank.load(args.data / "scenes.npz"), ViewBank.load(args.data / "views.npz")
-    env = Env(bank, views, TASKS[args.task], args.impl, EnvConfig(num_envs=args.batch))
+    env = make_env(bank, views, args.task, args.impl, EnvConfig(num_envs=args.batch))
     policies = {
-        "random": lambda state, key: jax.random.uniform(key, (args.batch, ACTION), minval=-1, maxval=1),
+        "random": lambda state, key: jax.random.uniform(key, (args.batch, env.action_size), minval=-1, maxval=1),
         "expert": lambda state, key: scripted_action(env, state),
     }
     print(f"{args.task}, {args.impl}: {len(env.bank)} Scenes, {len(env.views)} views, {args.batch} trials")

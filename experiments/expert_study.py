@@ -14,11 +14,10 @@ import tyro
 
 from vatmart_jax.atomic_io import write_json
 from vatmart_jax.data.dataset import Data
-from vatmart_jax.envs.env import TASKS, Env, EnvConfig
+from vatmart_jax.envs import TASKS, Env, EnvConfig
 from vatmart_jax.envs.scripted_policy import scripted_action, scripted_start
 from vatmart_jax.evaluation.metrics import wilson_interval
 from vatmart_jax.physics import PhysicsConfig
-from vatmart_jax.physics.scene_model import FINGER_OPEN, FINGERS
 from vatmart_jax.trajectory import WAYPOINTS
 
 
@@ -53,7 +52,7 @@ def study(env: Env, trials: int, seed: int) -> dict[str, Any]:
     def run(key):
         k_start, k_expert = jax.random.split(key)
         begun = env.begin_trials(scripted_start(env, env.sample(k_start, env.config.num_envs), k_expert))
-        step = lambda state, _: (env.step(state, scripted_action(env, state), False),) * 2
+        step = lambda state, _: (env.step(state, scripted_action(env, state), terminate_on_failure=False),) * 2
         final, path = jax.lax.scan(step, begun, length=WAYPOINTS)
         return {
             "scene": final.physics.scene,
@@ -64,7 +63,7 @@ def study(env: Env, trials: int, seed: int) -> dict[str, Any]:
             "success": final.success,
             "in_collision": final.in_collision,
             "grasped": begun.valid,
-            "grip": begun.physics.qpos[:, FINGERS].sum(-1),
+            "grip": begun.physics.qpos[:, env.physics.gripper.finger_qpos].sum(-1),
             "lost": begun.valid & ~final.grasp_held,
             "lost_first": begun.valid & ~path.grasp_held[0],
         }
@@ -79,10 +78,10 @@ def study(env: Env, trials: int, seed: int) -> dict[str, Any]:
     rows["too_far"] = rows["grasped"] & ~rows["lost"] & (ratio > 1 + env.config.tolerance)
     everything = np.ones(trials, bool)
     result = {"trials": trials, **_rates(rows, everything)}
-    if env.task.opening:
+    if env.task.grasps:
         handle = env.views.contact_handle[rows["view"], rows["contact"]]
         # Where nothing was grasped the handle's width is not known: it counts as one that fits.
-        fits = handle & (~rows["grasped"] | (rows["grip"] < 2 * FINGER_OPEN - 0.01))
+        fits = handle & (~rows["grasped"] | (rows["grip"] < 2 * env.physics.gripper.max_opening - 0.01))
         for name, chosen in (("handle", handle), ("handle_that_fits", fits), ("edge", ~handle)):
             if chosen.any():
                 result[name] = {"trials": int(chosen.sum()), **_rates(rows, chosen)}

@@ -18,7 +18,7 @@ from PIL import Image
 
 from vatmart_jax.atomic_io import atomic_write
 from vatmart_jax.data.banks import SceneBank, ViewBank
-from vatmart_jax.envs.env import TASKS, Env
+from vatmart_jax.envs import TASKS, make_env
 from vatmart_jax.priors.pretrained import run_folder
 from vatmart_jax.priors.priors import Priors
 from vatmart_jax.viz import plots
@@ -54,7 +54,7 @@ def main(args: Figure) -> None:
         priors = Priors.load(run_folder(Path(run)))
         recording, result = play(args.data, scene, amount=float(amount), run=run_folder(Path(run)), seed=args.seed)
         chosen = np.array([find_scene(bank, scene)])
-        env = Env(bank.select(chosen), views.of_scenes(chosen), TASKS[priors.config.task])
+        env = make_env(bank.select(chosen), views.of_scenes(chosen), TASKS[priors.config.task])
         view, task = int(recording.state.start.view[0]), float(recording.state.start.goal[0])
         points, mask = env.views.points[view].astype(np.float32), env.views.part_mask[view]
         found = priors.predict(points, task, mask, jax.random.key(args.seed))
@@ -62,10 +62,11 @@ def main(args: Figure) -> None:
         moved = result["moved"] if priors.config.task.endswith("drawer") else np.degrees(result["moved"])
         with tempfile.TemporaryDirectory() as folder:
             heat, film = Path(folder) / "heat.png", Path(folder) / "trial.gif"
-            plots.priors(
-                points, mask, np.asarray(found.actionability), found.contact, np.asarray(found.trajectories[:3]),
-                np.asarray(found.scores[:3]), (float(env.views.azimuth[view]), float(env.views.elevation[view])),
-                f"{priors.config.task} by {asked}", heat, env.config.standoff,
+            plots.priors_figure(
+                heat, points=points, part_mask=mask, actionability=np.asarray(found.actionability),
+                contact=found.contact, trajectories=np.asarray(found.trajectories[:3]),
+                scores=np.asarray(found.scores[:3]), camera=env.views.camera(view), standoff=env.config.standoff,
+                title=f"{priors.config.task} by {asked}",
             )  # fmt: skip
             animate(recording, film)
             row[0].imshow(plt.imread(heat))

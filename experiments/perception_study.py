@@ -22,9 +22,9 @@ import tyro
 from vatmart_jax.atomic_io import write_json
 from vatmart_jax.config import to_json
 from vatmart_jax.data.dataset import Data
-from vatmart_jax.envs.env import TASKS
+from vatmart_jax.envs import TASKS
 from vatmart_jax.errors import UserError
-from vatmart_jax.physics.types import default_impl
+from vatmart_jax.physics import default_impl
 from vatmart_jax.pipeline.run_config import settings_of
 from vatmart_jax.pipeline.run_dir import RunDir, read_config
 from vatmart_jax.pipeline.trainer import STAGES, PipelineTrainer, run_seconds

@@ -22,11 +22,12 @@ import tyro
 from vatmart_jax.atomic_io import write_json
 from vatmart_jax.bench.benchmarks import Choice, device, random_trials
 from vatmart_jax.data.banks import SceneBank, ViewBank
-from vatmart_jax.envs.env import TASKS, Env, EnvConfig, EnvState, TrialStart
+from vatmart_jax.envs import TASKS, Env, EnvConfig, EnvState, TrialStart, make_env
 from vatmart_jax.envs.scripted_policy import run_scripted_policy
 from vatmart_jax.physics import PhysicsConfig
 from vatmart_jax.physics.controller import waypoint_controls
-from vatmart_jax.physics.scene_model import HAND, N_CTRL, PART, scene_model
+from vatmart_jax.physics.gripper import PART
+from vatmart_jax.physics.scene_model import scene_model
 from vatmart_jax.pipeline.exploration import start_pool
 from vatmart_jax.trajectory import WAYPOINTS
 
@@ -68,11 +69,11 @@ def tracking(env: Env, n: int, key: jax.Array) -> dict[str, float]:
     physics, config = env.physics, env.config
     nowhere = jnp.tile(jnp.array([-5.0, 0, 0, 1, 0, 0, 0]), (n, 1))
     reach = jnp.array([config.max_translation] * 3 + [config.max_rotation] * 3 + [0.0] * 2)
-    target = jax.random.uniform(key, (n, N_CTRL), minval=-1.0) * reach
-    state = jax.jit(physics.reset)(jnp.zeros(n, jnp.int32), nowhere, jnp.zeros((n, N_CTRL + 1)))
-    path = waypoint_controls(jnp.zeros((n, N_CTRL)), target, physics.config)
+    target = jax.random.uniform(key, (n, physics.gripper.num_ctrl), minval=-1.0) * reach
+    state = jax.jit(physics.reset)(jnp.zeros(n, jnp.int32), nowhere, jnp.zeros((n, physics.gripper.num_ctrl + 1)))
+    path = waypoint_controls(jnp.zeros((n, physics.gripper.num_ctrl)), target, physics.config)
     state = jax.jit(physics.rollout)(state, path, jnp.ones(n, bool))
-    error = np.abs(np.asarray(state.qpos[:, HAND] - target[:, :6]))
+    error = np.abs(np.asarray(state.qpos[:, physics.gripper.hand_qpos] - target[:, :6]))
     place, angle = error[:, :3].max(1), np.degrees(error[:, 3:].max(1))
     return {
         "position_median_mm": 1e3 * float(np.median(place)),
@@ -115,7 +116,7 @@ def pressing(env: Env, start: TrialStart, trials: int) -> dict[str, float]:
         data.mocap_pos[1], data.mocap_quat[1] = np.split(final.physics.gripper_pose[i], [3])
         mujoco.mj_forward(model, data)
         depth.append(-float(data.contact.dist.min()) if data.ncon else 0.0)
-        q, width = data.qpos[PART], env.bank.width[scene]
+        q, width = data.qpos[PART], env.bank.joint_range[scene]
         past.append(max(0.0, -q, q - width))
     share = float(np.mean(np.array(depth) > 0.05))
     return {
@@ -147,7 +148,7 @@ def slip(env: Env, start: TrialStart, key: jax.Array) -> dict[str, float]:
 def study(args: Study, name: str, bank: SceneBank, views: ViewBank) -> dict[str, Any]:
     config = PhysicsConfig()
     halved = replace(config, timestep=config.timestep / 2, steps_per_waypoint=2 * config.steps_per_waypoint)
-    make = lambda physics: Env(bank, views, TASKS[name], "c", EnvConfig(num_envs=args.trials), physics)
+    make = lambda physics: make_env(bank, views, name, "c", EnvConfig(num_envs=args.trials), physics)
     env, finer = make(config), make(halved)
     k_start, k_noise, k_any, k_track = jax.random.split(jax.random.key(args.seed), 4)
     start = start_pool(env, k_start, args.trials)
@@ -161,7 +162,7 @@ def study(args: Study, name: str, bank: SceneBank, views: ViewBank) -> dict[str,
         "tracking": tracking(env, args.trials, k_track),
         "coasting": coasting(env, noisy),
     }
-    if env.task.opening:
+    if env.task.grasps:
         return {**result, "slip": slip(env, start, k_any)}
     return {**result, "pressing": pressing(env, start, args.trials)}
 

@@ -18,7 +18,7 @@ import tyro
 
 from vatmart_jax.atomic_io import write_json
 from vatmart_jax.data.banks import SceneBank, ViewBank
-from vatmart_jax.envs.env import ACTION, TASKS, Env, EnvConfig
+from vatmart_jax.envs import TASKS, Env, EnvConfig, make_env
 from vatmart_jax.trajectory import WAYPOINTS
 
 
@@ -45,7 +45,7 @@ def main(args: RandomTrials) -> None:
     batches = -(-args.trials // (len(TASKS) * args.batch))
     escaped = 0
     for number, task in enumerate(TASKS.values()):
-        env = Env(bank, views, task, args.impl, EnvConfig(num_envs=args.batch))
+        env = make_env(bank, views, task, args.impl, EnvConfig(num_envs=args.batch))
         counts = result["tasks"].setdefault(
             task.name, {"objects": len(np.unique(env.bank.object_id)), "scenes": len(env.bank), "batches": 0}
         )
@@ -70,7 +70,7 @@ def _trials(env: Env, key: jax.Array) -> dict[str, jax.Array]:
     begun = env.reset(k_reset)
 
     def step(state, key):
-        action = jax.random.uniform(key, (len(state.done), ACTION), minval=-1, maxval=1)
+        action = jax.random.uniform(key, (len(state.done), env.action_size), minval=-1, maxval=1)
         state = env.step(state, action, terminate_on_failure=False)
         return state, _not_finite(state)
 

@@ -15,7 +15,7 @@ import tyro
 
 from vatmart_jax.atomic_io import write_json
 from vatmart_jax.data.dataset import Data
-from vatmart_jax.envs.env import TASKS, Env, TrialStart
+from vatmart_jax.envs import TASKS, Env, TrialStart
 from vatmart_jax.pipeline.exploration import ExplorationLoop
 from vatmart_jax.pipeline.proposal_rollouts import interactions_of
 from vatmart_jax.pipeline.run_config import settings_of

@@ -173,11 +173,12 @@ def scene_bank(objects: list[Cabinet]) -> SceneBank:
         part=column(lambda _, name, *rest: name),
         joint=column(lambda _, name, *rest: f"joint_{name}"),
         variant=np.zeros(len(scenes), np.int32),
+        part_kind=column(lambda _, name, *rest: name),
         joint_type=column(lambda c, n, part, *_: part.joint_type, np.int32),
         part_pos=column(lambda c, n, p, pos, quat, axis: pos, float),
         part_quat=column(lambda c, n, p, pos, quat, axis: quat, float),
         axis=column(lambda c, n, p, pos, quat, axis: axis, float),
-        width=column(lambda c, n, part, *_: part.width, float),
+        joint_range=column(lambda c, n, part, *_: part.width, float),
         urdf_closed=np.zeros(len(scenes)),
         urdf_sign=np.ones(len(scenes)),
     )
@@ -192,12 +193,15 @@ def view_bank(objects: list[Cabinet]) -> ViewBank:
                 for k in range(cabinet.views):
                     share = (0.1 if opening else 0.6) + 0.1 * k
                     views.append(_view(rng, scene, cabinet, part, opening, share * part.width))
-    columns = [np.stack([view[k] for view in views]) for k in range(11)]
-    kinds = (np.int32, np.float32, bool, np.float32, np.float32, np.float16, np.float16, bool, np.float32, np.float32)
-    return ViewBank(*[c.astype(kind) for c, kind in zip(columns, (*kinds, bool), strict=True)])
+    types = {
+        "scene": np.int32, "joint_pos": np.float32, "direction": np.int8, "azimuth": np.float32,
+        "elevation": np.float32, "points": np.float16, "part_mask": bool, "contacts": np.float32,
+        "contact_normals": np.float32, "contact_handle": bool,
+    }  # fmt: skip
+    return ViewBank(**{name: np.stack([view[name] for view in views]).astype(dtype) for name, dtype in types.items()})
 
 
-def _view(rng, scene: int, cabinet: Cabinet, part: Part, opening: bool, q: float) -> tuple:
+def _view(rng, scene: int, cabinet: Cabinet, part: Part, opening: bool, q: float) -> dict:
     """One row of a ViewBank: 64 points, half of them on the panel, and 16 contacts."""
 
     def front(box: Box, n: int, margin: float) -> np.ndarray:
@@ -211,11 +215,11 @@ def _view(rng, scene: int, cabinet: Cabinet, part: Part, opening: bool, q: float
     contacts = part.moved(np.concatenate([front(panel, 8, 0.08), held]), q)
     points = np.concatenate([part.moved(front(panel, 32, 0.0), q), front(back, 32, 0.0)])
     order, outward = rng.permutation(64), np.array([[-1.0, 0, 0]])
-    normals = np.where(np.arange(64)[:, None] < 32, part.turned(outward, q), outward)
     contact_normals = np.repeat(part.turned(outward, q), 16, 0)
     mask = order < 32
     azimuth, elevation = rng.uniform(-1, 1), rng.uniform(0.5, 1.0)
-    return (
-        np.int32(scene), q, opening, azimuth, elevation, points[order], normals[order], mask,
-        contacts, contact_normals, np.arange(16) >= 8,
-    )  # fmt: skip
+    return {
+        "scene": scene, "joint_pos": q, "direction": 1 if opening else -1, "azimuth": azimuth, "elevation": elevation,
+        "points": points[order], "part_mask": mask, "contacts": contacts, "contact_normals": contact_normals,
+        "contact_handle": np.arange(16) >= 8,
+    }  # fmt: skip

@@ -78,9 +78,8 @@ def load_plugins() -> None:
             try:
                 _load(entry)
             except Exception as e:  # a plugin raises whatever it runs into
-                raise UserError(
-                    f"{PLUGINS}: {entry}: not loaded ({type(e).__name__}: {summarize_error(e)}); name a module or a .py file"
-                ) from e
+                why = f"{type(e).__name__}: {summarize_error(e)}"
+                raise UserError(f"{PLUGINS}: {entry}: not loaded ({why}); name a module or a .py file") from e
 
 
 def _load(entry: str) -> None:

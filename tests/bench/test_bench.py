@@ -9,7 +9,7 @@ from boxes import as_boxes
 
 from vatmart_jax import bench, cli, presets
 from vatmart_jax.data.banks import HINGE
-from vatmart_jax.envs.env import TASKS, Env
+from vatmart_jax.envs import make_env
 from vatmart_jax.perception.networks import NetworksConfig
 from vatmart_jax.perception.pointnet2 import PointNet2Config, SetAbstraction
 from vatmart_jax.pipeline.exploration import start_pool
@@ -68,7 +68,7 @@ def test_boxes_behave_nearly_as_the_hulls_they_were_whatever_the_order_of_scenes
 
 
 def test_random_trials_repeat_exactly_open_loop(cabinets):
-    env = Env(*cabinets, TASKS["push-drawer"])
+    env = make_env(*cabinets, "push-drawer")
     key = jax.random.key(0)
     start = start_pool(env, key, 16)
     closed = jax.jit(lambda start: bench.random_trials(env, start, key))(start)

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from vatmart_jax.data.dataset import SPLITS, Data, DataError, prepare
-from vatmart_jax.envs.env import TASKS, EnvConfig
+from vatmart_jax.envs import TASKS, EnvConfig
 from vatmart_jax.physics import PhysicsConfig
 
 

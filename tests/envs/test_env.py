@@ -10,10 +10,12 @@ from scipy.spatial.transform import Rotation
 
 from vatmart_jax import rotations as rot
 from vatmart_jax.data.banks import HINGE, SceneBank, ViewBank
-from vatmart_jax.envs.env import ACTION, OBSERVATION, TASKS, Env, EnvConfig, EnvState, TrialStart, reward_terms
+from vatmart_jax.envs import EnvConfig, EnvState, TrialStart, make_env
+from vatmart_jax.envs.rewards import reward_terms
 from vatmart_jax.trajectory import WAYPOINTS, unpack_trajectory
 
-BATCH = 16
+BATCH, ACTION, OBSERVATION = 16, 6, 33
+TASKS = ("push-door", "pull-door", "push-drawer", "pull-drawer")
 KEY = jax.random.key(0)
 
 
@@ -26,7 +28,7 @@ class Trials:
     """An environment with its functions jitted."""
 
     def __init__(self, cabinets: tuple[SceneBank, ViewBank], task: str):
-        self.env = Env(*cabinets, TASKS[task], config=EnvConfig(num_envs=BATCH))
+        self.env = make_env(*cabinets, task, config=EnvConfig(num_envs=BATCH))
         self.reset, self.step = jit(self.env.reset), jit(self.env.step)
         self.begin, self.execute = jit(self.env.begin_trials), jit(self.env.execute)
         self.sample = jit(lambda key: self.env.sample(key, 5000))
@@ -39,7 +41,8 @@ class Trials:
         up = -views.contact_normals[view, contact]
         rotation = rot.gripper_frame(jnp.asarray(up), jnp.broadcast_to(jnp.asarray(forward, jnp.float32), up.shape))
         return TrialStart(
-            jnp.asarray(view, jnp.int32), jnp.asarray(contact, jnp.int32), jnp.full(BATCH, task), rotation
+            view=jnp.asarray(view, jnp.int32), contact=jnp.asarray(contact, jnp.int32), goal=jnp.full(BATCH, task),
+            rotation=rotation,
         )  # fmt: skip
 
     def expert(self, state: EnvState) -> jax.Array:
@@ -52,7 +55,7 @@ class Trials:
             then = nearest + rot.rotate(rot.matrix_from_rotvec(axis * share), contact - nearest)
         else:
             then = contact + axis * share
-        move = then - (contact if env.task.opening else tip)
+        move = then - (contact if env.task.grasps else tip)
         turn = axis * share if hinge else jnp.zeros_like(axis)
         return jnp.concatenate([move / env.config.max_translation, turn / env.config.max_rotation], -1)
 
@@ -112,11 +115,11 @@ def test_resets_are_determined_by_their_key(runs):
 @pytest.mark.parametrize("task", TASKS)
 def test_tasks_fit_the_room_and_approaches_the_cone(runs, task):
     env, start = runs(task).env, runs(task).sample(KEY)
-    q, width = env.views.q[start.view], env.bank.width[env.views.scene[start.view]]
-    room = width - q if env.task.opening else q
-    assert (start.goal >= env.task.low - 1e-6).all()
-    assert (start.goal <= np.minimum(env.task.high, room) + 1e-6).all()
-    assert np.isin(np.unique(env.views.opening[start.view]), [env.task.opening])
+    q, width = env.views.joint_pos[start.view], env.bank.joint_range[env.views.scene[start.view]]
+    room = width - q if env.task.grasps else q
+    assert (start.goal >= env.task.goal_range[0] - 1e-6).all()
+    assert (start.goal <= np.minimum(env.task.goal_range[1], room) + 1e-6).all()
+    assert np.isin(np.unique(env.views.direction[start.view]), [env.task.direction])
     inward = -env.views.contact_normals[start.view, start.contact]
     assert ((np.asarray(start.rotation)[:, :, 2] * inward).sum(-1) > np.cos(env.config.approach_cone) - 1e-5).all()
     np.testing.assert_allclose(np.linalg.det(start.rotation), 1, atol=1e-4)
@@ -129,10 +132,10 @@ def test_tasks_fit_the_room_and_approaches_the_cone(runs, task):
 def test_the_task_given_the_view_is_that_of_a_uniform_task_and_then_a_uniform_start(runs, task):
     env, rng = runs(task).env, np.random.default_rng(0)
     view = 1
-    q, width = env.views.q[view], env.bank.width[env.views.scene[view]]
+    q, width = env.views.joint_pos[view], env.bank.joint_range[env.views.scene[view]]
     ours = np.asarray(env.sample_goal(KEY, jnp.full(2000, view)))
-    t = rng.uniform(env.task.low, min(env.task.high, width), 2_000_000)
-    start = rng.uniform(0, width - t) if env.task.opening else rng.uniform(t, width)
+    t = rng.uniform(env.task.goal_range[0], min(env.task.goal_range[1], width), 2_000_000)
+    start = rng.uniform(0, width - t) if env.task.grasps else rng.uniform(t, width)
     theirs = t[np.abs(start - q) < 0.002 * width]
     assert len(theirs) > 1000
     assert stats.ks_2samp(ours, theirs).pvalue > 1e-3
@@ -171,13 +174,13 @@ class Awning(Cabinet):
 def test_a_hand_that_an_obstacle_stops_on_the_way_leaves_no_way():
     """Where the drawer is pushed shut below the board, the hand's long side is in its way, the short one is not."""
     objects = [Awning("100", "StorageFurniture", "train", (0.40, 0.60, 0.70), 1, 0, (0.0, 0.0, 0.0), 3)]
-    env = Env(scene_bank(objects), view_bank(objects), TASKS["push-drawer"])
+    env = make_env(scene_bank(objects), view_bank(objects), "push-drawer")
     view, contact = (x.ravel() for x in np.meshgrid(np.arange(3), np.arange(8)))
     up = jnp.asarray(-env.views.contact_normals[view, contact])
     starts = {
         side: TrialStart(
-            jnp.asarray(view, jnp.int32), jnp.asarray(contact, jnp.int32), jnp.full(24, 0.1),
-            rot.gripper_frame(up, jnp.broadcast_to(jnp.asarray(axis, jnp.float32), up.shape)),
+            view=jnp.asarray(view, jnp.int32), contact=jnp.asarray(contact, jnp.int32), goal=jnp.full(24, 0.1),
+            rotation=rot.gripper_frame(up, jnp.broadcast_to(jnp.asarray(axis, jnp.float32), up.shape)),
         )
         for side, axis in (("upright", [0, 1, 0]), ("flat", [0, 0, 1]))
     }  # fmt: skip
@@ -392,9 +395,9 @@ def test_data_without_the_tasks_parts_or_room_is_refused_by_the_tasks_name(cabin
     bank, views = cabinets
     doors = np.flatnonzero(bank.joint_type == HINGE)
     with pytest.raises(ValueError, match=r"no drawer \(slide\), which task push-drawer needs"):
-        Env(bank.select(doors), views.of_scenes(doors), TASKS["push-drawer"])
+        make_env(bank.select(doors), views.of_scenes(doors), "push-drawer")
     with pytest.raises(ValueError, match=r"no view of a door \(hinge\) that can be moved by task pull-door"):
-        Env(bank, views.select(~views.opening), TASKS["pull-door"])
-    shut = replace(views, q=np.full_like(views.q, 0.01))
+        make_env(bank, views.select(views.direction < 0), "pull-door")
+    shut = replace(views, joint_pos=np.full_like(views.joint_pos, 0.01))
     with pytest.raises(ValueError, match="push-door"):
-        Env(bank, shut, TASKS["push-door"])
+        make_env(bank, shut, "push-door")

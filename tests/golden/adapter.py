@@ -20,7 +20,7 @@ from mjcf_assets.procedural.generate import generate
 from vatmart_jax.cli.main import COMMANDS, main
 from vatmart_jax.data.banks import SceneBank, ViewBank
 from vatmart_jax.data.dataset import Data
-from vatmart_jax.envs.env import TASKS, EnvConfig
+from vatmart_jax.envs import TASKS, EnvConfig
 from vatmart_jax.perception.networks import NetworksConfig
 from vatmart_jax.perception.pointnet2 import LocalGroup, PointNet2Config, SetAbstraction
 from vatmart_jax.perception.trainer import PerceptionConfig
@@ -50,7 +50,7 @@ HELP = {
     "vatmart": ("--help",),
     **{command: (command, "--help") for command in COMMANDS},
     **{f"bench-{what}": ("bench", what, "--help") for what in ("physics", "parity", "perception")},
-    **{f"train-{preset}": ("train", "--preset", preset, "--help") for preset in PRESETS},
+    **{f"train-{preset}": ("train", "--preset", preset, "--help") for preset in PRESETS if preset != "quick"},
 }
 """Name of a file of values/help -> the command's words."""
 

@@ -11,7 +11,9 @@ import trimesh
 import yourdfpy
 from penetration import penetration_depth, posed
 
-from conversion.partnet import PartNetObject, parts, read_object
+from conversion.model import ArticulatedObject
+from conversion.part_detection import detect_parts
+from conversion.readers.partnet_mobility import read_object
 from mjcf_assets.output_folder import GeneratorError
 from mjcf_assets.procedural.categories import CATEGORIES, Category
 from mjcf_assets.procedural.categories.appliances import microwave, refrigerator
@@ -32,7 +34,7 @@ def folder(tmp_path_factory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def objects(folder) -> list[PartNetObject]:
+def objects(folder) -> list[ArticulatedObject]:
     return [read_object(p) for p in sorted(folder.glob("9*"))]
 
 
@@ -74,7 +76,7 @@ def test_every_object_has_the_doors_and_drawers_it_says(folder, objects):
     for obj in objects:
         lines = (folder / obj.id / "semantics.txt").read_text().splitlines()
         expected = {x.split()[0] for x in lines if x.split()[2] in ("door", "rotation_door", "drawer")}
-        found, _ = parts(obj)
+        found, _ = detect_parts(obj)
         assert {p.link for p in found} == expected and expected
         assert all(p.closed == 0 and p.sign == 1 for p in found)
 
@@ -86,7 +88,7 @@ def test_fronts_face_the_camera_and_open_towards_it(objects):
     """
     otherwise = {"Door": [], "StorageFurniture": []}
     for obj in objects:
-        for part in parts(obj)[0]:
+        for part in detect_parts(obj)[0]:
             vertices = np.concatenate([v.vertices for v in obj.links[part.link].visuals])
             middle = np.append(vertices.mean(0), 1)
             closed, ajar = (
@@ -134,10 +136,10 @@ def test_meshes_are_closed_and_wound_outwards(folder):
 def test_parts_swing_free(objects):
     """No vertex of a part enters a leaf of the rest by more than 3 mm, from closed to open."""
     for obj in objects:
-        for part in parts(obj)[0]:
+        for part in detect_parts(obj)[0]:
             moving = set(obj.subtree(part.link))
             for share in (0.0, 0.1, 0.5, 1.0):
-                poses = obj.link_poses({part.joint: part.closed + part.sign * share * part.width})
+                poses = obj.link_poses({part.joint: part.closed + part.sign * share * part.joint_range})
                 points = np.concatenate([posed(v.vertices, poses[k]) for k in moving for v in obj.links[k].visuals])
                 for k, link in obj.links.items():
                     for v in link.visuals if k not in moving else ():

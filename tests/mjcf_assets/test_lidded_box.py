@@ -11,7 +11,8 @@ import pytest
 import trimesh
 from penetration import penetration_depth, posed
 
-from conversion.partnet import PartNetObject, read_object
+from conversion.model import ArticulatedObject
+from conversion.readers.partnet_mobility import read_object
 from mjcf_assets.procedural.categories.lidded_box import lidded_box
 from mjcf_assets.procedural.generate import generate
 from mjcf_assets.procedural.solids import Mesh
@@ -27,17 +28,17 @@ def folder(tmp_path_factory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def boxes(folder) -> list[PartNetObject]:
+def boxes(folder) -> list[ArticulatedObject]:
     return [read_object(p) for p in sorted(folder.glob("8*"))]
 
 
-def lids(obj: PartNetObject) -> list[str]:
+def lids(obj: ArticulatedObject) -> list[str]:
     """The links that are lids, by the words for them in semantics.txt."""
     lines = (obj.folder / "semantics.txt").read_text().splitlines()
     return [line.split()[0] for line in lines if line.endswith("hinge rotation_lid")]
 
 
-def triangles(obj: PartNetObject, links: list[str], values: dict[str, float]) -> trimesh.Trimesh:
+def triangles(obj: ArticulatedObject, links: list[str], values: dict[str, float]) -> trimesh.Trimesh:
     """The visual meshes of some links as one, in the object frame (z up, front towards -x)."""
     poses = obj.link_poses(values)
     visuals = [(v, poses[k]) for k in links for v in obj.links[k].visuals]
@@ -45,7 +46,7 @@ def triangles(obj: PartNetObject, links: list[str], values: dict[str, float]) ->
     return trimesh.util.concatenate(meshes)
 
 
-def seen_from_above(obj: PartNetObject, values: dict[str, float]) -> tuple[np.ndarray, np.ndarray]:
+def seen_from_above(obj: ArticulatedObject, values: dict[str, float]) -> tuple[np.ndarray, np.ndarray]:
     """What a grid of points over the body shows from above: where it is a lid, and how high it is, in 0..1 of the
     body's height; [n] each."""
     (body,) = [k for k in obj.links if k != "base" and k not in lids(obj)]

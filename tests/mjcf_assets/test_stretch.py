@@ -12,7 +12,8 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
-from conversion.partnet import parts, read_object
+from conversion.part_detection import detect_parts
+from conversion.readers.partnet_mobility import read_object
 from mjcf_assets.output_folder import GeneratorError
 from mjcf_assets.procedural.generate import generate
 from mjcf_assets.stretch import MAX_LOG_FACTOR, anisotropic_copies
@@ -55,7 +56,7 @@ def test_every_training_object_has_its_copies_and_no_other_has(source, copies):
 def test_the_closed_object_is_stretched_and_its_parts_are_the_same(source, copies):
     for name in training(source):
         original = read_object(source / name)
-        found, _ = parts(original)
+        found, _ = detect_parts(original)
         factors = []
         for k in range(2):
             copy = read_object(copies / f"{name}x{k}")
@@ -73,10 +74,10 @@ def test_the_closed_object_is_stretched_and_its_parts_are_the_same(source, copie
             np.testing.assert_allclose(after[found_at], before * factor, atol=2e-3)
             assert (np.abs(np.log(factor)) <= 2 * MAX_LOG_FACTOR).all() and abs(np.log(factor).sum()) < 1e-2
             factors.append(factor)
-            again, _ = parts(copy)
+            again, _ = detect_parts(copy)
             assert [(p.link, p.kind, p.sign) for p in again] == [(p.link, p.kind, p.sign) for p in found]
             for a, b in zip(found, again, strict=True):
-                assert b.width == pytest.approx(a.width) if a.kind == "door" else b.width > 0
+                assert b.joint_range == pytest.approx(a.joint_range) if a.kind == "door" else b.joint_range > 0
         assert np.abs(factors[0] - factors[1]).max() > 0.01
 
 
@@ -85,8 +86,8 @@ def test_an_open_drawer_goes_as_far_as_its_own_depth_allows(source, copies):
     seen = 0
     for name in training(source):
         original, copy = read_object(source / name), read_object(copies / f"{name}x0")
-        slides = {p.joint: p.closed + p.sign * p.width for p in parts(original)[0] if p.kind == "drawer"}
-        ends = {p.joint: p.closed + p.sign * p.width for p in parts(copy)[0] if p.kind == "drawer"}
+        slides = {p.joint: p.closed + p.sign * p.joint_range for p in detect_parts(original)[0] if p.kind == "drawer"}
+        ends = {p.joint: p.closed + p.sign * p.joint_range for p in detect_parts(copy)[0] if p.kind == "drawer"}
         if slides:
             factor = np.ptp(posed(copy, {}), axis=0) / np.ptp(posed(original, {}), axis=0)
             np.testing.assert_allclose(posed(copy, ends), posed(original, slides) * factor, atol=3e-3)

@@ -4,33 +4,23 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from pushes import APPROACH, BATCH, EVERYONE, STEPS, Pushes, assert_bitwise
 from scipy.spatial import ConvexHull
-from test_physics import (  # noqa: F401  its tests hold for this module's `doors`, too
-    APPROACH,
-    BATCH,
-    EVERYONE,
-    STEPS,
-    Pushes,
-    assert_bitwise,
-    test_bad_controls_mark_only_their_simulation_and_never_spread,
-    test_inactive_simulations_stay_bitwise_the_same,
-)
 
 from vatmart_jax.data.banks import HINGE, SceneBank
 from vatmart_jax.physics import PhysicsConfig, make_physics
 from vatmart_jax.physics.backend_c import CPhysics
 from vatmart_jax.physics.backend_mjx import CollisionSlots, MjxPhysics, _nearest
-from vatmart_jax.physics.scene_model import PART
+from vatmart_jax.physics.gripper import PART
 
 
 class MjxPushes(Pushes):
-    """The pushes of test_physics, by MJX; `c` is the reference."""
+    """The pushes of `pushes`, by MJX; `c` is the reference."""
 
     def __init__(self, cabinets, kind, collision="hull"):
         super().__init__(cabinets, kind, collision)
         self.c = self.physics
-        self.physics = make_physics(self.bank, "jax")
-        self.reset, self.rollout = jax.jit(self.physics.reset), jax.jit(self.physics.rollout)
+        self.use(make_physics(self.bank, "jax"))
 
     def steady(self) -> np.ndarray:
         """[BATCH, STEPS, 8]: forwards by 0.15."""
@@ -97,16 +87,6 @@ def test_bad_starts_are_marked_and_stay_as_they_are(doors):
         np.testing.assert_array_equal(s.diverged, np.isin(np.arange(BATCH), [1, 4]))
         assert not s.in_contact[1] and not s.in_contact[4]
     assert_bitwise(state, doors.pushed(), ~np.asarray(state.diverged))
-
-
-def test_ten_rollouts_with_changing_scenes_compile_once(doors):
-    reset, rollout, seen = jax.jit(doors.physics.reset), jax.jit(doors.physics.rollout), set()
-    for seed in range(10):
-        starts = doors.starts(seed)
-        seen.add(tuple(starts[0].tolist()))
-        assert np.isfinite(rollout(reset(*starts), doors.controls(seed), EVERYONE).qpos).all()
-    assert len(seen) == 10
-    assert (reset._cache_size(), rollout._cache_size()) == (1, 1)
 
 
 def test_each_box_gets_its_nearest_slots():

@@ -8,73 +8,22 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
-from boxes import as_boxes
+from pushes import APPROACH, BATCH, EVERYONE, GRIPPER, STEPS, Pushes, assert_bitwise
 from scipy.spatial.transform import Rotation
 
 from vatmart_jax import rotations as rot
-from vatmart_jax.data.banks import HINGE, SLIDE, SceneBank, ViewBank
-from vatmart_jax.physics import PhysicsConfig, PhysicsState, make_physics
+from vatmart_jax.data.banks import HINGE, SLIDE
+from vatmart_jax.errors import UserError
+from vatmart_jax.physics import PhysicsConfig, make_physics
 from vatmart_jax.physics.backend_c import CPhysics
-from vatmart_jax.physics.controller import hand_target, waypoint_controls
-from vatmart_jax.physics.scene_model import FINGER_OPEN, HAND, N_CTRL, N_QPOS, PART, TIP, scene_model, template
-
-BATCH, STEPS = 8, 60
-EVERYONE = np.ones(BATCH, bool)
-APPROACH = N_CTRL - 6  # the hand's z
-
-
-class Pushes:
-    """Jitted physics of a bank's Scenes of one joint type, and hands that push their fronts."""
-
-    def __init__(self, cabinets: tuple[SceneBank, ViewBank], kind: int, collision: str = "hull", threads: int = 0):
-        bank, views = cabinets
-        scenes = np.flatnonzero(bank.joint_type == kind)
-        self.bank, self.views = bank.select(scenes), views.of_scenes(scenes)
-        if collision == "box":
-            self.bank = as_boxes(self.bank)
-        self.physics = CPhysics(self.bank, PhysicsConfig(), threads)
-        self.reset, self.rollout = jax.jit(self.physics.reset), jax.jit(self.physics.rollout)
-
-    def starts(self, seed: int = 0) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Scenes, hand poses and qpos of BATCH simulations, the fingertips 0.03 before contacts of random views."""
-        rng = np.random.default_rng(seed)
-        scene = rng.permuted(np.resize(np.arange(len(self.bank)), BATCH))
-        view = np.array([rng.choice(np.flatnonzero(self.views.scene == s)) for s in scene])
-        contact = rng.integers(0, 8, BATCH)
-        up = -self.views.contact_normals[view, contact]
-        frame = rot.gripper_frame(jnp.asarray(up), jnp.asarray(rng.normal(size=(BATCH, 3)), jnp.float32))
-        position = self.views.contacts[view, contact] - (TIP + 0.03) * up
-        qpos = np.zeros((BATCH, N_QPOS), np.float32)
-        qpos[:, PART] = self.views.q[view]
-        return scene.astype(np.int32), np.concatenate([position, rot.quat_from_matrix(frame)], -1), qpos
-
-    def controls(self, seed: int = 0) -> np.ndarray:
-        """[BATCH, STEPS, 8]: forwards by 0.03 to 0.2, with noise on everything."""
-        rng = np.random.default_rng(100 + seed)
-        ctrl = 0.02 * np.cumsum(rng.normal(size=(BATCH, STEPS, N_CTRL)), 1) / np.sqrt(STEPS)
-        ctrl[..., 6:] = 0
-        ctrl[..., APPROACH] += rng.uniform(0.03, 0.2, (BATCH, 1)) * np.linspace(0, 1, STEPS)
-        return ctrl.astype(np.float32)
-
-    def pushed(self, seed: int = 0, rollouts: int = 1) -> PhysicsState:
-        state = self.reset(*self.starts(seed))
-        for k in range(rollouts):
-            state = self.rollout(state, self.controls(seed + k), EVERYONE)
-        return state
+from vatmart_jax.physics.controller import waypoint_controls
+from vatmart_jax.physics.gripper import PART
+from vatmart_jax.physics.scene_model import scene_model, template
 
 
 @pytest.fixture(scope="module")
 def doors(cabinets) -> Pushes:
     return Pushes(cabinets, HINGE)
-
-
-def rows(state: PhysicsState, chosen) -> list[np.ndarray]:
-    return [np.asarray(leaf)[chosen] for leaf in jax.tree.leaves(state)]
-
-
-def assert_bitwise(a: PhysicsState, b: PhysicsState, chosen=slice(None)):
-    for x, y in zip(rows(a, chosen), rows(b, chosen), strict=True):
-        np.testing.assert_array_equal(x.view(np.uint8), y.view(np.uint8))
 
 
 @pytest.mark.parametrize("collision", ["hull", "box"])
@@ -113,29 +62,6 @@ def test_unused_slots_change_nothing_but_rounding(doors):
         np.testing.assert_allclose(doors.pushed().qpos[i], data.qpos, atol=1e-6)
 
 
-def test_inactive_simulations_stay_bitwise_the_same(doors):
-    before, active = doors.pushed(), np.arange(BATCH) % 3 != 0
-    after = doors.rollout(before, doors.controls(1), active)
-    assert_bitwise(after, before, ~active)
-    assert (np.asarray(after.qpos)[active] != np.asarray(before.qpos)[active]).any(1).all()
-    assert_bitwise(after, doors.rollout(before, doors.controls(1), EVERYONE), active)
-
-
-@pytest.mark.parametrize("bad", [np.nan, np.inf])
-def test_bad_controls_mark_only_their_simulation_and_never_spread(doors, bad):
-    before, ctrl = doors.pushed(), doors.controls(1)
-    sound = doors.rollout(before, ctrl, EVERYONE)
-    ctrl[2, STEPS // 2, 3] = bad
-    after = doors.rollout(before, ctrl, EVERYONE)
-    np.testing.assert_array_equal(after.diverged, np.arange(BATCH) == 2)
-    assert_bitwise(after, sound, np.arange(BATCH) != 2)
-    assert_bitwise(after.replace(diverged=before.diverged), before, [2])
-    # It stays as it is, whatever comes.
-    again = doors.rollout(after, doors.controls(2), EVERYONE)
-    assert_bitwise(again, after, [2])
-    assert all(np.isfinite(leaf).all() for leaf in (again.qpos, again.qvel))
-
-
 def test_a_simulation_that_blows_up_is_marked_and_its_place_is_as_new_afterwards(doors):
     scene, pose, qpos = doors.starts()
     bad_pose, bad_qpos = pose.copy(), qpos.copy()
@@ -169,46 +95,11 @@ def test_divergence_is_noticed_every_time_and_said_nowhere_else(doors, tmp_path,
     assert capfd.readouterr().err == ""
 
 
-def test_ten_rollouts_with_changing_scenes_compile_once(doors):
-    traces = 0
-
-    @jax.jit
-    def trial(scene, pose, qpos, ctrl):
-        nonlocal traces
-        traces += 1
-        state = doors.physics.reset(scene, pose, qpos)
-        state, _ = jax.lax.scan(lambda s, c: (doors.physics.rollout(s, c, ~s.diverged), None), state, ctrl)
-        return state.qpos
-
-    seen = set()
-    for seed in range(10):
-        starts = doors.starts(seed)
-        seen.add(tuple(starts[0].tolist()))
-        found = trial(*starts, doors.controls(seed)[None].repeat(2, 0))
-        assert np.isfinite(found).all()
-    assert len(seen) == 10
-    assert (traces, trial._cache_size()) == (1, 1)
-    alone = doors.reset(*starts)
-    for _ in range(2):
-        alone = doors.rollout(alone, doors.controls(9), EVERYONE)
-    np.testing.assert_array_equal(found, alone.qpos)
-
-
-def test_vmap_over_a_leading_axis_equals_separate_calls(doors):
-    states = [doors.reset(*doors.starts(seed)) for seed in (0, 1)]
-    both = jax.jit(jax.vmap(doors.physics.reset))(*map(np.stack, zip(doors.starts(0), doors.starts(1), strict=True)))
-    ctrl, active = np.stack([doors.controls(0), doors.controls(1)]), np.ones((2, BATCH), bool)
-    both = jax.jit(jax.vmap(doors.physics.rollout))(both, ctrl, active)
-    for k in (0, 1):
-        assert_bitwise(jax.tree.map(lambda x, k=k: x[k], both), doors.rollout(states[k], ctrl[k], active[k]))
-    one_start = jax.jit(jax.vmap(doors.physics.rollout, (None, 0, None)))(states[0], ctrl, active[0])
-    for k in (0, 1):
-        assert_bitwise(jax.tree.map(lambda x, k=k: x[k], one_start), doors.rollout(states[0], ctrl[k], active[0]))
-
-
 def test_threads_do_not_change_results(cabinets, doors):
-    assert_bitwise(Pushes(cabinets, HINGE, threads=1).pushed(rollouts=2), doors.pushed(rollouts=2))
-    assert_bitwise(Pushes(cabinets, HINGE, threads=5).pushed(rollouts=2), doors.pushed(rollouts=2))
+    for threads in (1, 5):
+        pushes = Pushes(cabinets, HINGE)
+        pushes.use(CPhysics(pushes.bank, PhysicsConfig(), threads))
+        assert_bitwise(pushes.pushed(rollouts=2), doors.pushed(rollouts=2))
 
 
 def test_hands_inside_an_object_are_in_contact_from_the_start_and_others_are_not(doors):
@@ -227,30 +118,30 @@ def test_parts_have_the_configured_inertia_and_stay_within_their_range(cabinets)
         inertia = [np.asarray(row).ravel()[0] for row in pushes.physics._template.fields["dof_M0"]]
         np.testing.assert_allclose(inertia, PhysicsConfig().part_inertia[kind], rtol=1e-6)
         scene, pose, qpos = pushes.starts()
-        ctrl = np.zeros((BATCH, STEPS, N_CTRL), np.float32)
+        ctrl = np.zeros((BATCH, STEPS, GRIPPER.num_ctrl), np.float32)
         ctrl[..., APPROACH] = 1.0  # far behind the closed part
         state = pushes.reset(scene, pose, qpos)
         for _ in range(4):
             state = pushes.rollout(state, ctrl, EVERYONE)
         assert (state.qpos[:, PART] > -margin).all()
-        assert (state.qpos[:, PART] < pushes.bank.width[scene] + margin).all()
+        assert (state.qpos[:, PART] < pushes.bank.joint_range[scene] + margin).all()
 
 
 def test_hand_targets_put_the_fingertips_where_asked(doors):
     rng = np.random.default_rng(0)
     frames = jnp.asarray(Rotation.random(5, random_state=1).as_matrix(), jnp.float32)
     move, euler = (jnp.asarray(rng.uniform(-0.5, 0.5, (5, 3)), jnp.float32) for _ in range(2))
-    target = jax.jit(hand_target)(move, euler, frames, jnp.zeros(5))
+    target = jax.jit(GRIPPER.targets)(move, euler, frames, jnp.zeros(5))
     model = scene_model(doors.bank, 0, PhysicsConfig())
     data = mujoco.MjData(model)
     hand = model.body("hand").id
     for i in range(5):
         data.mocap_pos[1], data.mocap_quat[1] = [1, 2, 3], rot.quat_from_matrix(frames[i])
-        data.qpos[HAND] = target[i, :6]
+        data.qpos[GRIPPER.hand_qpos] = target[i, :6]
         mujoco.mj_kinematics(model, data)
         turned = data.xmat[hand].reshape(3, 3)
-        started = np.array([1, 2, 3]) + TIP * np.asarray(frames[i])[:, 2]
-        np.testing.assert_allclose(data.xpos[hand] + TIP * turned[:, 2], started + move[i], atol=1e-5)
+        started = np.array([1, 2, 3]) + GRIPPER.tip_offset * np.asarray(frames[i])[:, 2]
+        np.testing.assert_allclose(data.xpos[hand] + GRIPPER.tip_offset * turned[:, 2], started + move[i], atol=1e-5)
         np.testing.assert_allclose(turned, frames[i] @ rot.matrix_from_euler(euler[i]), atol=1e-5)
 
 
@@ -260,12 +151,12 @@ def test_the_free_hand_arrives_within_a_waypoint(doors):
     pose[:, :3] = [-3, 0, 0]
     rng = np.random.default_rng(0)
     target = np.concatenate([rng.uniform(-0.3, 0.3, (BATCH, 3)), rng.uniform(-0.7, 0.7, (BATCH, 3))], -1)
-    target = np.concatenate([target, np.full((BATCH, 2), FINGER_OPEN)], -1).astype(np.float32)
-    ctrl = waypoint_controls(jnp.zeros((BATCH, N_CTRL)), jnp.asarray(target), config)
-    assert ctrl.shape == (BATCH, config.steps_per_waypoint, N_CTRL)
+    target = np.concatenate([target, np.full((BATCH, 2), GRIPPER.max_opening)], -1).astype(np.float32)
+    ctrl = waypoint_controls(jnp.zeros((BATCH, GRIPPER.num_ctrl)), jnp.asarray(target), config)
+    assert ctrl.shape == (BATCH, config.steps_per_waypoint, GRIPPER.num_ctrl)
     np.testing.assert_allclose(ctrl[:, -1], target, atol=1e-6)
     state = doors.rollout(doors.reset(scene, pose, qpos), ctrl, EVERYONE)
-    np.testing.assert_allclose(state.qpos[:, HAND], target[:, :6], atol=1e-3)
+    np.testing.assert_allclose(state.qpos[:, GRIPPER.hand_qpos], target[:, :6], atol=1e-3)
     np.testing.assert_allclose(state.qpos[:, 7:], target[:, 6:], atol=1e-3)
     np.testing.assert_array_equal(state.qpos[:, PART], qpos[:, PART])
 
@@ -275,7 +166,7 @@ def test_banks_of_both_joint_types_and_unknown_implementations_are_refused(cabin
         template(cabinets[0], PhysicsConfig())
     with pytest.raises(ValueError, match="all of one joint type"):
         template(cabinets[0].select(np.zeros(0, int)), PhysicsConfig())
-    with pytest.raises(ValueError, match="'sapien' is not one of c"):
+    with pytest.raises(UserError, match="impl 'sapien' is not known; use one of c, warp, jax"):
         make_physics(cabinets[0], "sapien")
 
 
@@ -295,7 +186,7 @@ def test_halving_the_time_step_hardly_moves_the_part(cabinets):
 def test_a_single_cpu_does_not_wait_for_itself() -> None:
     program = """
 import os; os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})
-import vatmart_jax.physics.backend_c
+from vatmart_jax.physics.host_threads import allow_callbacks; allow_callbacks()
 import jax, jax.numpy as jnp, numpy as np
 x = jnp.full((512, 512), 1e-3)
 twice = lambda x: jax.pure_callback(lambda x: 2 * np.asarray(x), jax.ShapeDtypeStruct(x.shape, x.dtype), x @ x).sum()

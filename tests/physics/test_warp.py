@@ -3,24 +3,14 @@
 import sys
 from dataclasses import replace
 
-import jax
 import numpy as np
 import pytest
-from test_physics import (  # noqa: F401  its tests hold for this module's `doors`, too
-    BATCH,
-    EVERYONE,
-    Pushes,
-    assert_bitwise,
-    test_bad_controls_mark_only_their_simulation_and_never_spread,
-    test_inactive_simulations_stay_bitwise_the_same,
-    test_ten_rollouts_with_changing_scenes_compile_once,
-    test_vmap_over_a_leading_axis_equals_separate_calls,
-)
+from pushes import BATCH, EVERYONE, Pushes, assert_bitwise
 
 from vatmart_jax.data.banks import HINGE, SLIDE
 from vatmart_jax.errors import UserError
-from vatmart_jax.physics import PhysicsConfig, make_physics
-from vatmart_jax.physics.scene_model import PART
+from vatmart_jax.physics import BACKENDS, make_physics
+from vatmart_jax.physics.gripper import PART
 
 warp = pytest.importorskip("vatmart_jax.physics.backend_warp", exc_type=ImportError)
 
@@ -29,8 +19,7 @@ class WarpPushes(Pushes):
     def __init__(self, cabinets, kind: int, collision: str = "hull"):
         super().__init__(cabinets, kind, collision)
         self.in_c = (self.reset, self.rollout)
-        self.physics = warp.WarpPhysics(self.bank, PhysicsConfig())
-        self.reset, self.rollout = jax.jit(self.physics.reset), jax.jit(self.physics.rollout)
+        self.use(make_physics(self.bank, "warp"))
 
 
 @pytest.fixture(scope="module")
@@ -113,5 +102,6 @@ def test_contacts_without_room_are_divergence_from_the_start_on(cabinets, monkey
 def test_without_the_package_the_error_names_the_extra(cabinets, monkeypatch):
     monkeypatch.setitem(sys.modules, "mujoco_warp", None)
     monkeypatch.delitem(sys.modules, "vatmart_jax.physics.backend_warp")
+    monkeypatch.setitem(BACKENDS._entries, "warp", "vatmart_jax.physics.backend_warp:WarpPhysics")
     with pytest.raises(UserError, match=r"pip install 'vatmart-jax\[warp\]'"):
         make_physics(cabinets[0].select(cabinets[0].joint_type == HINGE), "warp")

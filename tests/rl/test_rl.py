@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from vatmart_jax.envs.env import reward_terms
+from vatmart_jax.envs.rewards import reward_terms
 from vatmart_jax.rl.replay_buffer import Episode, ReplayBuffer, Transition, hindsight
 from vatmart_jax.rl.td3 import TD3, TD3Config, TD3State
 

@@ -10,7 +10,7 @@ from PIL import Image
 
 from vatmart_jax import rotations as rot
 from vatmart_jax.data.banks import SceneBank, ViewBank
-from vatmart_jax.envs.env import TASKS, Env, EnvConfig
+from vatmart_jax.envs import EnvConfig, make_env
 from vatmart_jax.errors import UserError
 from vatmart_jax.trajectory import pack_trajectory, unpack_trajectory
 from vatmart_jax.viz.trial_video import find_scene, play
@@ -46,7 +46,7 @@ def test_scenes_are_named_by_object_by_part_and_by_index(cabinets):
 def test_a_recording_ends_where_the_environment_does(data, trajectory):
     recording, result = play(data, "200:drawer", trajectory=trajectory)
     bank, views = SceneBank.load(data / "scenes.npz"), ViewBank.load(data / "views.npz")
-    env = Env(bank.select([3]), views.of_scenes([3]), TASKS["push-drawer"], config=EnvConfig(num_envs=1))
+    env = make_env(bank.select([3]), views.of_scenes([3]), "push-drawer", config=EnvConfig(num_envs=1))
     start = recording.state.start
     end = jax.jit(env.execute)(start, unpack_trajectory(np.load(trajectory)[None])[1])
     np.testing.assert_allclose(recording.qpos[-1], end.physics.qpos[0], atol=1e-4)

@@ -23,15 +23,15 @@ import jax.numpy as jnp
 import numpy as np
 
 from vatmart_jax.data.banks import SceneBank, ViewBank
-from vatmart_jax.envs.env import TASKS, Env, EnvConfig, EnvState, TrialStart
+from vatmart_jax.envs import TASKS, Env, EnvConfig, EnvState, TrialStart, make_env
 from vatmart_jax.envs.scripted_policy import scripted_action
 from vatmart_jax.errors import UserError, require_one_of
 from vatmart_jax.perception import trainer as perception
 from vatmart_jax.perception.config import TaskSpec
 from vatmart_jax.perception.grouped_views import group_views
 from vatmart_jax.perception.networks import Networks
-from vatmart_jax.physics.controller import hand_target, waypoint_controls
-from vatmart_jax.physics.types import IMPLS
+from vatmart_jax.physics import BACKENDS
+from vatmart_jax.physics.controller import waypoint_controls
 from vatmart_jax.pipeline.exploration import start_pool
 from vatmart_jax.pipeline.presets import PRESETS
 from vatmart_jax.trajectory import TRAJECTORY, WAYPOINTS
@@ -71,7 +71,7 @@ def bench_physics(
     memory would add up; the result is the first one's, and all are its `runs`.
     """
     require_one_of("--task", task, TASKS)
-    require_one_of("--impl", impl, IMPLS)
+    require_one_of("--impl", impl, BACKENDS.names())
     if min(batches) < 1:
         raise UserError(f"--batch {min(batches)}: a batch has one simulation or more")
     if len(batches) == 1:
@@ -85,7 +85,7 @@ def bench_physics(
 
 def _physics(choice: Choice, impl: str, batch: int, task: str, seed: int, seconds: float) -> dict[str, Any]:
     begun = time.perf_counter()
-    env = Env(*choice.banks(seed), TASKS[task], impl, EnvConfig(num_envs=batch))
+    env = make_env(*choice.banks(seed), TASKS[task], impl, EnvConfig(num_envs=batch))
     build_seconds = time.perf_counter() - begun
     key, k_start, k_noise = jax.random.split(jax.random.key(seed), 3)
     start = start_pool(env, k_start, batch)
@@ -136,7 +136,7 @@ def bench_parity(
     With a twin, another conversion of the same objects (boxes for hulls), the first implementation runs on that too.
     """
     for impl in impls:
-        require_one_of("--impls", impl, IMPLS)
+        require_one_of("--impls", impl, BACKENDS.names())
     bank, views = choice.banks(seed)
     variants = {impl: (impl, bank) for impl in impls}
     if twin is not None:
@@ -144,13 +144,13 @@ def bench_parity(
         variants = {impl: (impl, bank) for impl in impls} | {f"{impls[0]} on {other.collision}": (impls[0], other)}
     outcomes: dict[str, dict[str, EnvState]] = {}  # by task and variant
     for name, task in TASKS.items():
-        if not (bank.joint_type == task.joint_type).any():
+        if not (bank.part_kind == task.part_kind).any():
             say(f"{name}: no Scene")
             continue
         outcomes[name] = {}
         for variant, (impl, its_bank) in variants.items():
             begun = time.perf_counter()
-            env = Env(its_bank, views, task, impl)
+            env = make_env(its_bank, views, task, impl)
             if not outcomes[name]:
                 k_start, k_noise = jax.random.split(jax.random.key(seed))
                 start = start_pool(env, k_start, trials)
@@ -280,11 +280,11 @@ def _timed(call: Callable[[int], Any], seconds: float) -> _Timing:
 
 def _press(env: Env, state: EnvState, advances: jax.Array) -> EnvState:
     """Waypoints along the hand's approach (back, when pulling), one per number of `advances`; none is left out."""
-    forward = (-1.0 if env.task.opening else 1.0) * state.start.rotation[:, :, 2]
+    forward = (-1.0 if env.task.grasps else 1.0) * state.start.rotation[:, :, 2]
 
     def waypoint(state: EnvState, advance: jax.Array) -> tuple[EnvState, None]:
         tip = state.tip + advance * forward
-        target = hand_target(tip, state.euler, state.start.rotation, jnp.zeros(len(tip)))
+        target = env.physics.gripper.targets(tip, state.euler, state.start.rotation, jnp.zeros(len(tip)))
         path = waypoint_controls(state.ctrl, target, env.physics.config)
         physics = env.physics.rollout(state.physics, path, ~state.physics.diverged)
         return state.replace(physics=physics, ctrl=target, tip=tip), None

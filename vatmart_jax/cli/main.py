@@ -6,7 +6,7 @@ import os
 import sys
 from collections.abc import Callable
 from ctypes.util import find_library
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -16,6 +16,7 @@ from tyro.conf import Positional, arg
 from vatmart_jax import __version__
 from vatmart_jax.atomic_io import atomic_directory, write_json
 from vatmart_jax.errors import OpenGLError, UserError, require_one_of
+from vatmart_jax.registry import load_plugins
 
 _Json = Annotated[bool, arg(help="print one JSON object as the last line of standard output")]
 
@@ -30,6 +31,7 @@ def main(argv: list[str] | None = None) -> None:
         print(_usage(), file=sys.stdout if argv[:1] in (["-h"], ["--help"]) else sys.stderr)
         sys.exit(0 if argv[:1] in (["-h"], ["--help"]) else 2)
     try:
+        load_plugins()
         COMMANDS[argv[0]](argv[1:])
     except UserError as e:
         sys.exit(_fail(str(e)))
@@ -63,25 +65,10 @@ def _print_result(result: dict[str, Any], as_json: bool, table: str = "") -> Non
 
 def _convert(argv: list[str]) -> None:
     """Convert PartNet-Mobility objects to MJCF, reports and banks."""
-    from conversion.convert import ConvertConfig, convert
-
-    @dataclass(frozen=True)
-    class Convert:
-        """Convert PartNet-Mobility objects to MJCF, reports and banks. What is up to date is left as it is."""
-
-        src: Positional[tuple[Path, ...]]
-        """object folders, or folders of such folders"""
-        out: Path
-        jobs: int | None = None
-        """processes; default one per core"""
-        json: _Json = False
-        config: Annotated[ConvertConfig, arg(name="")] = field(default_factory=ConvertConfig)
+    from conversion.command import Convert
 
     args = tyro.cli(Convert, args=argv, prog="vatmart convert")
-    if not args.src:
-        raise UserError("no source; give one or more object folders, or folders of such folders")
-    result = convert(args.src, args.out, args.config, args.jobs)
-    _print_result(asdict(result), args.json)
+    _print_result(args.run(), args.json)
 
 
 def _generate(argv: list[str]) -> None:
@@ -126,7 +113,7 @@ def _train(argv: list[str]) -> None:
     args = tyro.cli(Train, args=argv, prog="vatmart train")
     _enable_compilation_cache()
     from vatmart_jax.data.dataset import Data
-    from vatmart_jax.physics.types import default_impl
+    from vatmart_jax.physics import default_impl
     from vatmart_jax.pipeline.run_dir import check_folder
     from vatmart_jax.reporting import ConsoleReporter
     from vatmart_jax.workflows.train import resolve, train
@@ -172,7 +159,7 @@ def _evaluate(argv: list[str]) -> None:
     if not args.run:
         raise UserError("no run; give one or more run folders of `vatmart train`")
     _enable_compilation_cache()
-    from vatmart_jax.physics.types import default_impl
+    from vatmart_jax.physics import default_impl
     from vatmart_jax.reporting import ConsoleReporter
     from vatmart_jax.workflows.evaluate import evaluate
 
@@ -442,13 +429,14 @@ def _peek(argv: list[str], flag: str) -> str | None:
 
 def _prepared(data: Path | None, say: Callable[[str], None], points: int = 0) -> Path:
     """The converted folder of `data`, or of the bundled objects; views made now have at least so many points."""
-    from conversion.convert import ConvertConfig, convert
+    from conversion.config import ConvertConfig, ViewConfig
+    from conversion.convert import convert
     from mjcf_assets.procedural.generate import generate
     from vatmart_jax.data.dataset import BUNDLED_COUNT, BUNDLED_SEED, prepare
 
     def convert_into(source: Path, out: Path) -> None:
         say(f"converting {source} (what is up to date stays)")
-        config = ConvertConfig(points=max(points, ConvertConfig.points))
+        config = ConvertConfig(view=ViewConfig(points=max(points, ViewConfig.points)))
         for failure in convert([source], out, config).failed:
             say(f"refused {failure['id']}: {failure['reason']}")
 

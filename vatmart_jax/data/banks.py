@@ -5,14 +5,16 @@ geometry and labels only. Physics constants (gains, masses, friction) belong to 
 changing them needs no new conversion.
 
 Frames: the object frame is the world frame, z up, the object's front towards -x, unit lengths as in the dataset.
-A part's coordinate is its *opening* q >= 0: radians (hinge) or unit lengths (slide) away from closed, whatever sign
-and offset the URDF's joint uses.
+A part's joint position q >= 0 is in radians (hinge) or unit lengths (slide) away from closed, whatever sign and offset
+the URDF's joint uses.
+
+Files carry a format number; those of earlier formats are migrated while they are loaded (`_MIGRATIONS`).
 """
 
 from __future__ import annotations
 
 import zipfile
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
@@ -23,19 +25,21 @@ import numpy as np
 from flax import struct
 
 from vatmart_jax.atomic_io import atomic_write
+from vatmart_jax.camera import Camera
+from vatmart_jax.data.part_kinds import HINGE as HINGE
+from vatmart_jax.data.part_kinds import SLIDE as SLIDE
 from vatmart_jax.errors import UserError
 
-HINGE, SLIDE = 0, 1
-FORMAT = 1
+FORMAT = 2
 
 
 class BankError(UserError):
     """A bank file is missing, truncated or not what it should be."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class SceneBank:
-    """S Scenes, each one door or drawer of one object with everything else static (host arrays).
+    """S Scenes, each one moving part of one object with everything else static (host arrays).
 
     Collision geometry is a table of G shapes, shared by all Scenes, and I instances that place shapes in a Scene.
     Shapes are convex hulls (`collision == "hull"`: vertices `hull_start[g]:hull_start[g+1]` of `hull_vertices`) or
@@ -58,16 +62,21 @@ class SceneBank:
     part: np.ndarray  # [S] str, URDF name of the moving link
     joint: np.ndarray  # [S] str, URDF name of its joint
     variant: np.ndarray  # [S] int32, 0 = other parts closed; further ones have them at sampled values
+    part_kind: np.ndarray  # [S] str, name of a PartKind: door, drawer, lid
     joint_type: np.ndarray  # [S] int32, HINGE or SLIDE
     part_pos: np.ndarray  # [S, 3] float64, part frame when closed, object frame; its origin lies on the joint's axis
     part_quat: np.ndarray  # [S, 4] float64 wxyz
     axis: np.ndarray  # [S, 3] float64 unit, part frame; positive motion opens
-    width: np.ndarray  # [S] float64, the joint's range is [0, width]
+    joint_range: np.ndarray  # [S] float64, joint positions are in [0, joint_range]
     urdf_closed: np.ndarray  # [S] float64, URDF joint value = urdf_closed + urdf_sign * q
     urdf_sign: np.ndarray  # [S] float64, +1 or -1
 
     def __len__(self) -> int:
         return len(self.object_id)
+
+    @property
+    def n_shapes(self) -> int:
+        return len(self.box_size) if self.collision == "box" else len(self.hull_start) - 1
 
     def hull(self, shape: int) -> np.ndarray:
         """Vertices [n, 3] of one hull."""
@@ -101,20 +110,22 @@ class SceneBank:
         return SceneBank(**out)
 
     @classmethod
-    def joined(cls, banks: Sequence[SceneBank]) -> SceneBank:
+    def concatenate(cls, banks: Sequence[SceneBank]) -> SceneBank:
         """One bank of the Scenes of several, in their order. Raises ValueError where collision geometry differs."""
         if len(kinds := {bank.collision for bank in banks}) > 1:
             raise ValueError(f"their collision geometry differs ({', '.join(sorted(kinds))})")
-        table = lambda name: np.concatenate([getattr(bank, name) for bank in banks])
-        out: dict[str, Any] = {name: table(name) for name in (*_PER_SCENE, "hull_vertices", "box_size")}
+        out: dict[str, Any] = {
+            name: np.concatenate([getattr(bank, name) for bank in banks])
+            for name in (*_PER_SCENE, *_PER_INSTANCE, "hull_vertices", "box_size")
+        }
         out["hull_start"] = _starts(bank.hull_start for bank in banks)
         statics, parts = (_starts(getattr(bank, name) for bank in banks) for name in ("static_start", "part_start"))
         out["static_start"], out["part_start"] = statics, statics[-1] + parts
         # Statics come before parts: those of all banks, as in each of them.
         is_part = np.concatenate([np.arange(len(bank.instance_shape)) >= bank.static_start[-1] for bank in banks])
         order = np.argsort(is_part, kind="stable")
-        out |= {name: table(name)[order] for name in _PER_INSTANCE}
-        shapes = np.cumsum([0] + [max(len(bank.hull_start) - 1, len(bank.box_size)) for bank in banks[:-1]])
+        out |= {name: out[name][order] for name in _PER_INSTANCE}
+        shapes = np.cumsum([0] + [bank.n_shapes for bank in banks[:-1]])
         first = np.repeat(shapes, [len(bank.instance_shape) for bank in banks])[order]
         out["instance_shape"] = (out["instance_shape"] + first).astype(np.int32)
         return cls(collision=banks[0].collision, **out)
@@ -132,13 +143,13 @@ class SceneBank:
 
 
 _PER_SCENE = (
-    "object_id", "category", "split", "part", "joint", "variant", "joint_type",
-    "part_pos", "part_quat", "axis", "width", "urdf_closed", "urdf_sign",
+    "object_id", "category", "split", "part", "joint", "variant", "part_kind", "joint_type",
+    "part_pos", "part_quat", "axis", "joint_range", "urdf_closed", "urdf_sign",
 )  # fmt: skip
 _PER_INSTANCE = ("instance_shape", "instance_pos", "instance_quat", "instance_handle")
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class ViewBank:
     """V partial point clouds of Scenes at one start value each (host arrays).
 
@@ -148,12 +159,11 @@ class ViewBank:
     """
 
     scene: np.ndarray  # [V] int32
-    q: np.ndarray  # [V] float32, opening of the part in the picture
-    opening: np.ndarray  # [V] bool, drawn for a pull task (room left to open) or a push task (room left to close)
+    joint_pos: np.ndarray  # [V] float32, of the part in the picture
+    direction: np.ndarray  # [V] int8, +1 drawn for tasks that open (range left to open), -1 for those that close
     azimuth: np.ndarray  # [V] float32 rad, camera direction about z, 0 = in front (-x)
     elevation: np.ndarray  # [V] float32 rad
     points: np.ndarray  # [V, N, 3] float16, object frame
-    normals: np.ndarray  # [V, N, 3] float16 unit, towards the camera
     part_mask: np.ndarray  # [V, N] bool, the point lies on the moving part
     contacts: np.ndarray  # [V, C, 3] float32, object frame
     contact_normals: np.ndarray  # [V, C, 3] float32 unit, towards the camera
@@ -161,6 +171,11 @@ class ViewBank:
 
     def __len__(self) -> int:
         return len(self.scene)
+
+    def camera(self, view: int, centre: np.ndarray | None = None) -> Camera:
+        """The camera that took a view, looking at `centre` [3] (default the origin) from one unit length away."""
+        at = np.zeros(3) if centre is None else centre
+        return Camera.looking_at(at, float(self.azimuth[view]), float(self.elevation[view]))
 
     def select(self, views: np.ndarray) -> ViewBank:
         """The bank of only these views (indices or boolean mask)."""
@@ -174,8 +189,8 @@ class ViewBank:
         return ViewBank(**{**{f.name: getattr(kept, f.name) for f in fields(kept)}, "scene": new[kept.scene]})
 
     @classmethod
-    def joined(cls, banks: Sequence[ViewBank], scenes: Sequence[int]) -> ViewBank:
-        """One bank of the views of several, whose Scenes number `scenes`, to match `SceneBank.joined`.
+    def concatenate(cls, banks: Sequence[ViewBank], scenes: Sequence[int]) -> ViewBank:
+        """One bank of the views of several, whose Scenes number `scenes`, to match `SceneBank.concatenate`.
 
         Raises ValueError where the views have different numbers of points or contacts.
         """
@@ -195,26 +210,42 @@ class ViewBank:
         return cls(**_load(path, "views", [f.name for f in fields(cls)]))
 
 
-@struct.dataclass
-class Scenes:
+@struct.dataclass(kw_only=True)
+class SceneTable:
     """What the environment needs of S Scenes, on device."""
 
-    category: jax.Array  # [S] int32, index into the sorted category names of this bank
     anchor: jax.Array  # [S, 3] a point on the joint's axis, object frame
     axis: jax.Array  # [S, 3] unit, object frame, positive motion opens
-    width: jax.Array  # [S]
-    n_categories: int = struct.field(pytree_node=False)
+    joint_range: jax.Array  # [S]
 
     @classmethod
-    def of(cls, bank: SceneBank) -> Scenes:
-        names, category = np.unique(bank.category, return_inverse=True)
+    def from_bank(cls, bank: SceneBank) -> SceneTable:
         w, v = bank.part_quat[:, :1], bank.part_quat[:, 1:]
         t = 2 * np.cross(v, bank.axis)
         axis = bank.axis + w * t + np.cross(v, t)
-        as_f32 = lambda a: jnp.asarray(a, jnp.float32)
         return cls(
-            jnp.asarray(category, jnp.int32), as_f32(bank.part_pos), as_f32(axis), as_f32(bank.width), len(names)
+            anchor=jnp.asarray(bank.part_pos, jnp.float32),
+            axis=jnp.asarray(axis, jnp.float32),
+            joint_range=jnp.asarray(bank.joint_range, jnp.float32),
         )
+
+
+def _scenes_of_format_1(arrays: dict[str, Any]) -> None:
+    """Every hinge was a door."""
+    arrays["part_kind"] = np.where(arrays["joint_type"] == SLIDE, "drawer", "door")
+    arrays["joint_range"] = arrays.pop("width")
+
+
+def _views_of_format_1(arrays: dict[str, Any]) -> None:
+    """Views had the normals of all points too, which nothing read and `_load` leaves alone."""
+    arrays["joint_pos"] = arrays.pop("q")
+    arrays["direction"] = np.where(arrays.pop("opening"), 1, -1).astype(np.int8)
+
+
+_MIGRATIONS: dict[tuple[str, int], Callable[[dict[str, Any]], None]] = {  # from this format to the next, in place
+    ("scenes", 1): _scenes_of_format_1,
+    ("views", 1): _views_of_format_1,
+}
 
 
 def _starts(starts: Iterable[np.ndarray]) -> np.ndarray:
@@ -232,9 +263,13 @@ def _load(path: Path | str, kind: str, names: list[str]) -> dict:
         raise BankError(f"{path}: no such file; make it with `vatmart convert`")
     try:
         with np.load(path, allow_pickle=False) as f:
-            if str(f["kind"]) != kind or int(f["format"]) != FORMAT:
+            found = int(f["format"])
+            if str(f["kind"]) != kind or not 1 <= found <= FORMAT:
                 raise BankError(f"{path}: not a {kind} bank of format {FORMAT}; make it again with `vatmart convert`")
-            return {name: f[name] for name in names}
+            arrays = {name: f[name] for name in f.files if name not in ("format", "kind", "normals")}
+        for number in range(found, FORMAT):
+            _MIGRATIONS[kind, number](arrays)
+        return {name: arrays[name] for name in names}
     except (OSError, EOFError, KeyError, TypeError, ValueError, zipfile.BadZipFile) as e:  # TypeError: a .npy file
         if isinstance(e, BankError):
             raise

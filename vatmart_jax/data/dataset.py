@@ -12,7 +12,7 @@ from filelock import FileLock, Timeout
 
 from vatmart_jax import __version__
 from vatmart_jax.data.banks import SceneBank, ViewBank
-from vatmart_jax.envs.env import Env, EnvConfig, Task
+from vatmart_jax.envs import Env, EnvConfig, Task, make_env
 from vatmart_jax.errors import UserError
 from vatmart_jax.physics import PhysicsConfig
 
@@ -93,8 +93,8 @@ class Data:
             scenes.append(bank.select(chosen))
             views.append(its_views.of_scenes(chosen))
         try:
-            self._scenes = SceneBank.joined(scenes)
-            self._views = ViewBank.joined(views, [len(bank) for bank in scenes])
+            self._scenes = SceneBank.concatenate(scenes)
+            self._views = ViewBank.concatenate(views, [len(bank) for bank in scenes])
         except ValueError as e:
             folders = ", ".join(map(str, (self.folder, *more)))
             raise DataError(f"{folders}: cannot be trained on together: {e}; convert them with the same flags") from e
@@ -105,7 +105,7 @@ class Data:
         if len(chosen) == 0:
             raise DataError(f"{self.folder}: has no object of the split {split}; see splits.json")
         try:
-            return Env(self._scenes.select(chosen), self._views.of_scenes(chosen), task, impl, config, physics)
+            return make_env(self._scenes.select(chosen), self._views.of_scenes(chosen), task, impl, config, physics)
         except ValueError as e:
             raise DataError(f"{self.folder}, split {split}: {e}") from e
 

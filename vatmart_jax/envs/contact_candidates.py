@@ -1,65 +1,79 @@
-"""Where on a part a trial may begin, and how a hand would grasp there: host arrays, from the banks alone."""
+"""Where on a part a task may be done, and how a hand would grasp there: host arrays, from the banks alone."""
 
 from __future__ import annotations
 
-import jax.numpy as jnp
+from typing import Literal, NamedTuple
+
 import numpy as np
 import trimesh
+from scipy.spatial.transform import Rotation
 
-from vatmart_jax import rotations as rot
-from vatmart_jax.data.banks import HINGE, SLIDE, SceneBank, Scenes, ViewBank
+from vatmart_jax.data.banks import HINGE, SLIDE, SceneBank, SceneTable, ViewBank
+from vatmart_jax.envs.task import Task
 
 _HANDLE_POINTS, _HAND_REACH = 200, 0.05  # per shape of a handle; unit lengths about the contact
+_FACING, _ACROSS, _MIN_LEVER = 0.5, 0.4, 0.1  # cosines of normal and motion; unit lengths from a hinge's axis
 
 
-def candidate_contacts(bank: SceneBank, views: ViewBank, opening: bool) -> np.ndarray:
+class Grasps(NamedTuple):
+    """The canonical grasp at every contact: float32 unit vectors, object frame."""
+
+    approach: np.ndarray  # [V, C, 3]
+    closing: np.ndarray  # [V, C, 3] along which the fingers close
+
+
+def candidate_contacts(bank: SceneBank, views: ViewBank, task: Task) -> np.ndarray:
     """[V, C] bool: where the task may be done.
 
-    Push: faces that look against the part's motion, off its axis. Pull: handles, and faces along the motion and off the
-    axis, which two fingers may straddle; an environment keeps those where the hand fits, handles first.
+    Push: faces that look against the part's motion, off its axis; outside faces close a door, inside faces open it.
+    Grasp: handles, and faces along the motion and off the axis, which two fingers may straddle.
     """
-    motion, arm = _motion(bank, views)
-    along = (views.contact_normals * motion).sum(-1)
-    if not opening:
-        return (along > 0.5) & (arm > 0.1)
-    return views.contact_handle | ((np.abs(along) < 0.4) & (arm > 0.1))
+    motion, lever = _opening_motion(bank, views)
+    along = task.direction * (views.contact_normals * motion).sum(-1)
+    if not task.grasps:
+        return (along < -_FACING) & (lever > _MIN_LEVER)
+    return views.contact_handle | ((np.abs(along) < _ACROSS) & (lever > _MIN_LEVER))
 
 
-def canonical_grasps(bank: SceneBank, views: ViewBank) -> tuple[np.ndarray, np.ndarray]:
-    """The straight grasp at every contact: approach direction [V, C, 3] and the axis along which the fingers close
-    [V, C, 3], float32 unit, object frame.
+def canonical_grasps(
+    bank: SceneBank, views: ViewBank, handle_approach: Literal["motion", "normal"] = "motion"
+) -> Grasps:
+    """The canonical grasp at every contact.
 
-    A handle is approached against the opening motion, the fingers closing across the thin side of what of the handle
-    is within their reach. Elsewhere the hand comes along the inward normal and the fingers close along the motion.
+    A handle is approached against the part's opening motion, or along the contact's inward normal; the fingers close
+    across the thin side of what of the handle is within their reach. Elsewhere the hand comes along the inward normal
+    and the fingers close along the motion: so they straddle a panel at its free edge.
     """
-    motion, _ = _motion(bank, views)
-    up = np.where(views.contact_handle[..., None], -motion, -views.contact_normals)
-    across = motion.copy()
+    motion, _ = _opening_motion(bank, views)
+    approach = -views.contact_normals
+    if handle_approach == "motion":
+        approach = np.where(views.contact_handle[..., None], -motion, approach)
+    closing = motion.copy()
     surfaces = {s: _handle_surface(bank, s) for s in np.unique(views.scene).tolist()}
+    rotations, positions = _part_poses(bank, views)
     for view in np.flatnonzero(views.contact_handle.any(1)):
-        scene = int(views.scene[view])
+        surface = surfaces[int(views.scene[view])]
         rows = np.flatnonzero(views.contact_handle[view])
         # Contacts and directions in the part's frame, where its shapes are.
-        rotation, position = _part_pose(bank, scene, float(views.q[view]))
-        contact = (views.contacts[view, rows] - position) @ rotation
-        if len(surfaces[scene]):
-            local = _thin_axes(surfaces[scene], contact, up[view, rows] @ rotation)
-            across[view, rows] = local @ rotation.T
-    across -= (across * up).sum(-1, keepdims=True) * up
-    across /= np.maximum(np.linalg.norm(across, axis=-1, keepdims=True), 1e-6)
-    return up.astype(np.float32), across.astype(np.float32)
+        rotation = rotations[view]
+        contact = (views.contacts[view, rows] - positions[view]) @ rotation
+        if len(surface):
+            closing[view, rows] = _thin_axes(surface, contact, approach[view, rows] @ rotation) @ rotation.T
+    closing -= (closing * approach).sum(-1, keepdims=True) * approach
+    closing /= np.maximum(np.linalg.norm(closing, axis=-1, keepdims=True), 1e-6)
+    return Grasps(approach.astype(np.float32), closing.astype(np.float32))
 
 
-def _motion(bank: SceneBank, views: ViewBank) -> tuple[np.ndarray, np.ndarray]:
+def _opening_motion(bank: SceneBank, views: ViewBank) -> tuple[np.ndarray, np.ndarray]:
     """Unit directions [V, C, 3] in which contacts move as the part opens, and their distance to the axis [V, C]
     (slides: 1)."""
-    scenes = Scenes.of(bank)
-    axis = np.broadcast_to(np.asarray(scenes.axis)[views.scene][:, None], views.contacts.shape)
+    table = SceneTable.from_bank(bank)
+    axis = np.broadcast_to(np.asarray(table.axis)[views.scene][:, None], views.contacts.shape)
     if bank.joint_type[0] == SLIDE:
         return axis, np.ones(axis.shape[:2])
-    motion = np.cross(axis, views.contacts - np.asarray(scenes.anchor)[views.scene][:, None])
-    arm = np.linalg.norm(motion, axis=-1)
-    return motion / np.maximum(arm, 1e-6)[..., None], arm
+    motion = np.cross(axis, views.contacts - np.asarray(table.anchor)[views.scene][:, None])
+    lever = np.linalg.norm(motion, axis=-1)
+    return motion / np.maximum(lever, 1e-6)[..., None], lever
 
 
 def _handle_surface(bank: SceneBank, scene: int) -> np.ndarray:
@@ -71,27 +85,29 @@ def _handle_surface(bank: SceneBank, scene: int) -> np.ndarray:
         corners = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
         vertices = bank.hull(shape) if bank.collision == "hull" else corners * bank.box_size[shape]
         surface = trimesh.sample.sample_surface(trimesh.convex.convex_hull(vertices), _HANDLE_POINTS, seed=0)[0]
-        rotation = np.asarray(rot.matrix_from_quat(jnp.asarray(bank.instance_quat[row], jnp.float32)))
-        found.append(surface @ rotation.T + bank.instance_pos[row])
+        rotation = Rotation.from_quat(bank.instance_quat[row], scalar_first=True)
+        found.append(rotation.apply(surface) + bank.instance_pos[row])
     return np.concatenate(found)
 
 
-def _part_pose(bank: SceneBank, scene: int, q: float) -> tuple[np.ndarray, np.ndarray]:
-    """Rotation [3, 3] and position [3] of the part's frame at opening q, object frame."""
-    rotation = np.asarray(rot.matrix_from_quat(jnp.asarray(bank.part_quat[scene], jnp.float32)))
+def _part_poses(bank: SceneBank, views: ViewBank) -> tuple[np.ndarray, np.ndarray]:
+    """Rotations [V, 3, 3] and positions [V, 3] of the part's frame in each view, object frame."""
+    scene, q = views.scene, views.joint_pos.astype(float)[:, None]
+    rotation = Rotation.from_quat(bank.part_quat[scene], scalar_first=True)
     axis, position = bank.axis[scene], bank.part_pos[scene]
-    if bank.joint_type[scene] == HINGE:
-        return rotation @ np.asarray(rot.matrix_from_rotvec(jnp.asarray(axis * q, jnp.float32))), position
-    return rotation, position + rotation @ axis * q
+    if bank.joint_type[0] == HINGE:
+        return (rotation * Rotation.from_rotvec(axis * q)).as_matrix(), position
+    return rotation.as_matrix(), position + rotation.apply(axis) * q
 
 
-def _thin_axes(surface: np.ndarray, contacts: np.ndarray, up: np.ndarray) -> np.ndarray:
-    """[n, 3] for contacts [n, 3]: the direction across `up` [n, 3] in which the surface near the contact is thin."""
-    side = np.where(np.abs(up[:, 2:]) < 0.9, [[0.0, 0.0, 1.0]], [[0.0, 1.0, 0.0]])
-    x = np.cross(side, up)
+def _thin_axes(surface: np.ndarray, contacts: np.ndarray, approach: np.ndarray) -> np.ndarray:
+    """[n, 3] for contacts [n, 3]: the direction across `approach` [n, 3] in which the surface near the contact is
+    thin."""
+    side = np.where(np.abs(approach[:, 2:]) < 0.9, [[0.0, 0.0, 1.0]], [[0.0, 1.0, 0.0]])
+    x = np.cross(side, approach)
     x /= np.linalg.norm(x, axis=-1, keepdims=True)
     angle = np.linspace(0, np.pi, 24, endpoint=False)[:, None, None]
-    directions = np.cos(angle) * x + np.sin(angle) * np.cross(up, x)  # [24, n, 3]
+    directions = np.cos(angle) * x + np.sin(angle) * np.cross(approach, x)  # [24, n, 3]
     offset = surface - contacts[:, None]  # [n, p, 3]
     distance = np.linalg.norm(offset, axis=-1)
     near = distance < np.maximum(_HAND_REACH, distance.min(-1, keepdims=True) + 0.01)

@@ -45,7 +45,9 @@ def labelled(explorer: ExplorationLoop, policy: Any, count: int, key: jax.Array)
     n = len(positive.view)
     rng = np.random.default_rng(np.asarray(jax.random.key_data(key)))
     off = np.exp(rng.choice([-1, 1], n) * rng.uniform(0.2, 1.0, n))  # a fifth to e times off, either way
-    shifted = positive.replace(goal=np.clip(positive.displacement * off, 0.5 * task.low, 1.5 * task.high))
+    shifted = positive.replace(
+        goal=np.clip(positive.displacement * off, 0.5 * task.goal_range[0], 1.5 * task.goal_range[1])
+    )
     wrong = ~np.asarray(shifted.success(tolerance))
     shifted = jax.tree.map(lambda a: a[wrong], shifted)
     half = min(n // 2, len(failed.view))

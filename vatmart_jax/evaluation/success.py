@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from vatmart_jax.envs.env import Env, EnvState, TrialStart
+from vatmart_jax.envs import Env, EnvState, TrialStart
 from vatmart_jax.evaluation.metrics import reliability, wilson_interval
 from vatmart_jax.trajectory import WAYPOINTS
 

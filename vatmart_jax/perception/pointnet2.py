@@ -1,9 +1,9 @@
 """PointNet++ (single-scale grouping, segmentation) in pure JAX.
 
 Which points are sampled, grouped and interpolated depends on a cloud alone, not on the weights: `group` computes it
-once per view, and every pass of the network reuses it. Query points (contact candidates, or the cloud itself for a heat
-map) are not sampled; their features are interpolated and, where the config has local groups, joined by a feature of
-the points around each of them, which resolves handles that the coarse levels miss.
+once per view, and every pass of the network reuses it. Query points (contact candidates, or the cloud itself for a
+heat map) are not sampled; their features are interpolated and, where the config has local groups, joined by a feature
+of the points around each of them, which resolves handles that the coarse levels miss.
 
 Source: Qi et al. 2017; sizes as in VAT-Mart's and Where2Act's released networks.
 """

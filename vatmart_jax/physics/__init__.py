@@ -4,7 +4,18 @@
 inside `jit` and `scan`, and which never recompile when scenes, poses or controls change.
 """
 
-from vatmart_jax.physics.scene_model import PhysicsConfig
-from vatmart_jax.physics.types import Physics, PhysicsState, make_physics
+from vatmart_jax.physics.config import PhysicsConfig
+from vatmart_jax.physics.gripper import GRIPPERS, Gripper
+from vatmart_jax.physics.registry import BACKENDS, default_impl, make_physics
+from vatmart_jax.physics.types import Physics, PhysicsState
 
-__all__ = ["Physics", "PhysicsConfig", "PhysicsState", "make_physics"]
+__all__ = [
+    "BACKENDS",
+    "GRIPPERS",
+    "Gripper",
+    "Physics",
+    "PhysicsConfig",
+    "PhysicsState",
+    "default_impl",
+    "make_physics",
+]

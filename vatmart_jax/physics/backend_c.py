@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import os
 import threading
 from contextlib import contextmanager
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -13,13 +13,11 @@ import numpy as np
 from mujoco.batch import Batch
 
 from vatmart_jax.data.banks import SceneBank
-from vatmart_jax.physics.scene_model import N_CTRL, N_QPOS, SCENE_FIELDS, PhysicsConfig, template
-from vatmart_jax.physics.types import PhysicsState
-
-# XLA copies a callback's arguments on the pool of threads of which the callback occupies one: on a single CPU it would
-# wait for itself for ever. Read when JAX's backend starts.
-if (len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()) == 1:
-    os.environ.setdefault("NPROC", "2")
+from vatmart_jax.physics.config import PhysicsConfig
+from vatmart_jax.physics.gripper import GRIPPERS
+from vatmart_jax.physics.host_threads import allow_callbacks
+from vatmart_jax.physics.scene_model import SCENE_FIELDS, template
+from vatmart_jax.physics.types import PhysicsState, recorded_rollout
 
 # float64 numbers a simulation carries between calls: position, velocity and the solver's warm start.
 _EXACT = ("qpos", "qvel", "qacc_warmstart")
@@ -33,7 +31,8 @@ class CPhysics:
     """
 
     def __init__(self, bank: SceneBank, config: PhysicsConfig, threads: int = 0):
-        self.config = config
+        allow_callbacks()
+        self.config, self.gripper = config, GRIPPERS.get(config.gripper)
         self._template = template(bank, config)
         self._threads = threads  # 0: all cores
         self._pools: dict[int, _Pool] = {}  # by number of simulations
@@ -42,29 +41,33 @@ class CPhysics:
     def reset(self, scene: jax.Array, gripper_pose: jax.Array, qpos: jax.Array) -> PhysicsState:
         result = self._result(scene.shape)
         outputs = jax.pure_callback(self._reset, result, scene, gripper_pose, qpos, vmap_method="broadcast_all")
-        return PhysicsState(scene, gripper_pose, *outputs)
+        return _state(scene, gripper_pose, outputs)
 
-    def rollout(self, state: PhysicsState, ctrl: jax.Array, active: jax.Array) -> PhysicsState:
+    def rollout(
+        self, state: PhysicsState, ctrl: jax.Array, active: jax.Array, *, record_every: int | None = None
+    ) -> Any:
+        if record_every is not None:
+            return recorded_rollout(self, state, ctrl, active, record_every)
         outputs = jax.pure_callback(
             self._rollout, self._result(state.scene.shape), state, ctrl, active, vmap_method="broadcast_all"
         )
-        return PhysicsState(state.scene, state.gripper_pose, *outputs)
+        return _state(state.scene, state.gripper_pose, outputs)
 
     def _result(self, batch: tuple[int, ...]):
-        shape = jax.ShapeDtypeStruct
+        shape, nq = jax.ShapeDtypeStruct, self.gripper.num_qpos
         return (
-            shape((*batch, N_QPOS), jnp.float32),
-            shape((*batch, N_QPOS), jnp.float32),
+            shape((*batch, nq), jnp.float32),
+            shape((*batch, nq), jnp.float32),
             shape(batch, jnp.bool_),
             shape(batch, jnp.bool_),
-            shape((*batch, 2 * len(_EXACT) * N_QPOS), jnp.uint32),
+            shape((*batch, 2 * len(_EXACT) * nq), jnp.uint32),
         )
 
     def _reset(self, scene, gripper_pose, qpos):
-        batch = np.shape(scene)
+        batch, nq = np.shape(scene), self.gripper.num_qpos
         scene, pose = np.asarray(scene).reshape(-1), np.asarray(gripper_pose, np.float64).reshape(-1, 7)
-        exact = np.zeros((len(scene), len(_EXACT) * N_QPOS))
-        exact[:, :N_QPOS] = np.asarray(qpos).reshape(-1, N_QPOS)
+        exact = np.zeros((len(scene), len(_EXACT) * nq))
+        exact[:, :nq] = np.asarray(qpos).reshape(-1, nq)
         with self._lock:
             pool = self._pool(len(scene))
             pool.load(np.arange(len(scene)), scene, pose, exact)
@@ -79,7 +82,7 @@ class CPhysics:
         scene = np.asarray(state.scene).reshape(-1)
         pose = np.asarray(state.gripper_pose, np.float64).reshape(-1, 7)
         exact = np.ascontiguousarray(np.asarray(state.backend_state)).reshape(len(scene), -1).view(np.float64).copy()
-        ctrl = np.asarray(ctrl, np.float64).reshape(len(scene), -1, N_CTRL)
+        ctrl = np.asarray(ctrl, np.float64).reshape(len(scene), -1, self.gripper.num_ctrl)
         diverged = np.array(state.diverged).reshape(-1)
         contact = np.array(state.in_contact).reshape(-1)
         finite = np.isfinite(ctrl).all((1, 2))
@@ -96,7 +99,8 @@ class CPhysics:
         return self._pack(batch, exact, contact, diverged)
 
     def _pack(self, batch, exact, contact, diverged):
-        qpos, qvel = exact[:, :N_QPOS].astype(np.float32), exact[:, N_QPOS : 2 * N_QPOS].astype(np.float32)
+        nq = self.gripper.num_qpos
+        qpos, qvel = exact[:, :nq].astype(np.float32), exact[:, nq : 2 * nq].astype(np.float32)
         rows = (qpos, qvel, contact, diverged, np.ascontiguousarray(exact).view(np.uint32))
         return tuple(a.reshape(*batch, *a.shape[1:]) for a in rows)
 
@@ -104,6 +108,11 @@ class CPhysics:
         if n not in self._pools:
             self._pools[n] = _Pool(self._template, n, self._threads)
         return self._pools[n]
+
+
+def _state(scene: jax.Array, gripper_pose: jax.Array, outputs) -> PhysicsState:
+    names = ("qpos", "qvel", "in_contact", "diverged", "backend_state")
+    return PhysicsState(scene=scene, gripper_pose=gripper_pose, **dict(zip(names, outputs, strict=True)))
 
 
 class _Pool:
@@ -130,7 +139,7 @@ class _Pool:
         self._pos[ids, 1], self._quat[ids, 1] = pose[ids, :3], pose[ids, 3:]
 
     def run(self, ids: np.ndarray, ctrl: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Step; returns the exact state [n, 27] of `ids` and which of them stayed good [n] bool."""
+        """Step; returns the exact state [n, 3 * nq] of `ids` and which of them stayed good [n] bool."""
         # A reset after divergence sets MuJoCo's counters back, so a rise is seen only from zero.
         self.batch.warning[ids] = 0
         with _silent():

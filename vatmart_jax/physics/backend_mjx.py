@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -13,13 +13,14 @@ from mujoco.mjx._src import math, mesh  # no public names for these; mujoco-mjx 
 
 from vatmart_jax import rotations as rot
 from vatmart_jax.data.banks import SceneBank
-from vatmart_jax.physics.scene_model import PhysicsConfig, Template, scene_model, template
-from vatmart_jax.physics.types import PhysicsState, bits_of
+from vatmart_jax.physics.config import PhysicsConfig
+from vatmart_jax.physics.gripper import GRIPPERS
+from vatmart_jax.physics.scene_model import Template, scene_model, template
+from vatmart_jax.physics.types import PhysicsState, bits_of, recorded_rollout
 
-# MJX tests every pair of geoms that it is given, near or not. So each of the gripper's three boxes gets its own nearest
+# MJX tests every pair of geoms that it is given, near or not. So each of the gripper's boxes gets its own nearest
 # slots, chosen anew every few steps: this many of the static object and of the part. For hulls, fewer: each slot is a
 # kernel of its own to compile.
-BOXES = ("hand", "left_finger", "right_finger")
 NEAR = {"box": (2, 3), "hull": (1, 2)}
 RENEW = 4
 # Its Newton solver runs for the slowest of the batch, and its line search always to the end.
@@ -49,17 +50,18 @@ class MjxPhysics:
     """The trials of CPhysics in float32, with the contacts that MJX finds. `vmap` adds simulations to the batch."""
 
     def __init__(self, bank: SceneBank, config: PhysicsConfig):
-        self.config = config
+        self.config, self.gripper = config, GRIPPERS.get(config.gripper)
+        geoms = self.gripper.geoms
         full = template(bank, config)
         static, part = (np.flatnonzero(full.model.geom_bodyid == full.model.body(b).id) for b in ("object", "part"))
         self._near = [min(n, len(slots)) for n, slots in zip(NEAR[bank.collision], (static, part), strict=True)]
-        counts = [len(BOXES) * n for n in self._near]
+        counts = [len(geoms) * n for n in self._near]
         model = scene_model(bank, 0, config, (counts[0], counts[1]))
         model.opt.iterations, model.opt.ls_iterations = ITERATIONS, LS_ITERATIONS
-        boxes = [model.geom(name).id for name in BOXES]
-        near, own = sum(counts), np.concatenate([np.repeat(np.arange(len(BOXES)), n) for n in self._near])
+        boxes = [model.geom(name).id for name in geoms]
+        near, own = sum(counts), np.concatenate([np.repeat(np.arange(len(geoms)), n) for n in self._near])
         model.geom_contype[:near], model.geom_conaffinity[:near] = 0, 1 << own
-        model.geom_contype[boxes], model.geom_conaffinity[boxes] = 1 << np.arange(len(BOXES)), 0
+        model.geom_contype[boxes], model.geom_conaffinity[boxes] = 1 << np.arange(len(geoms)), 0
         self._meshes = _convex_meshes(full.model) if bank.collision == "hull" else None
         if self._meshes is not None:
             model.geom_dataid[:near] = model.mesh("parked").id
@@ -86,9 +88,16 @@ class MjxPhysics:
         sound = jnp.isfinite(qpos).all(-1) & jnp.isfinite(gripper_pose).all(-1)
         touches = jax.vmap(contact)(self._rows(scene), gripper_pose, qpos)
         zero = jnp.zeros_like(qpos)
-        return PhysicsState(scene, gripper_pose, qpos, zero, touches & sound, ~sound, bits_of(zero))
+        return PhysicsState(
+            scene=scene, gripper_pose=gripper_pose, qpos=qpos, qvel=zero, in_contact=touches & sound, diverged=~sound,
+            backend_state=bits_of(zero),
+        )  # fmt: skip
 
-    def rollout(self, state: PhysicsState, ctrl: jax.Array, active: jax.Array) -> PhysicsState:
+    def rollout(
+        self, state: PhysicsState, ctrl: jax.Array, active: jax.Array, *, record_every: int | None = None
+    ) -> Any:
+        if record_every is not None:
+            return recorded_rollout(self, state, ctrl, active, record_every)
         rows, pose = self._rows(state.scene), state.gripper_pose
         nearest = jax.vmap(self._nearest)
 

@@ -21,10 +21,10 @@ import warp as wp
 from jax.custom_batching import custom_vmap
 
 from vatmart_jax.data.banks import SceneBank
-from vatmart_jax.physics.scene_model import N_CTRL, N_QPOS, SCENE_FIELDS, PhysicsConfig, Template, template
-from vatmart_jax.physics.types import PhysicsState, bits_of
-
-wp.config.log_level = max(wp.config.log_level, wp.LOG_ERROR)  # it logs to standard output, which is for results
+from vatmart_jax.physics.config import PhysicsConfig
+from vatmart_jax.physics.gripper import GRIPPERS
+from vatmart_jax.physics.scene_model import SCENE_FIELDS, Template, template
+from vatmart_jax.physics.types import PhysicsState, bits_of, recorded_rollout
 
 # The others exist once per model in Warp, or not at all; Scenes do not differ in what Warp reads of them.
 _FIELDS = tuple(f for f in SCENE_FIELDS if f not in ("geom_sameframe", "body_sameframe", "body_simple", "dof_M0"))
@@ -42,7 +42,9 @@ class WarpPhysics:
     """
 
     def __init__(self, bank: SceneBank, config: PhysicsConfig):
-        self.config = config
+        # Warp logs to standard output, which is for results.
+        wp.config.log_level = max(wp.config.log_level, wp.LOG_ERROR)
+        self.config, self.gripper = config, GRIPPERS.get(config.gripper)
         self._template = template(bank, config)
         self._worlds: dict[int, _Worlds] = {}  # by number of simulations
         self._device = wp.device_from_jax(jnp.zeros(()).device)
@@ -57,9 +59,16 @@ class WarpPhysics:
         finite = jnp.isfinite(qpos).all(-1) & jnp.isfinite(pose).all(-1)
         contact, sound = self._contact(scene, pose, qpos, finite)
         rest = jnp.zeros_like(qpos)
-        return PhysicsState(scene, pose, qpos, rest, contact, ~sound, bits_of(rest))
+        return PhysicsState(
+            scene=scene, gripper_pose=pose, qpos=qpos, qvel=rest, in_contact=contact, diverged=~sound,
+            backend_state=bits_of(rest),
+        )  # fmt: skip
 
-    def rollout(self, state: PhysicsState, ctrl: jax.Array, active: jax.Array) -> PhysicsState:
+    def rollout(
+        self, state: PhysicsState, ctrl: jax.Array, active: jax.Array, *, record_every: int | None = None
+    ) -> Any:
+        if record_every is not None:
+            return recorded_rollout(self, state, ctrl, active, record_every)
         ctrl = jnp.asarray(ctrl, jnp.float32)
         diverged = state.diverged | (active & ~jnp.isfinite(ctrl).all((-2, -1)))
         active = active & ~diverged
@@ -81,7 +90,7 @@ class WarpPhysics:
 
     def _step(self, scene, *rest):
         n = len(scene)
-        rows = dict.fromkeys(("qpos_out", "qvel_out", "warmstart_out"), (n, N_QPOS))
+        rows = dict.fromkeys(("qpos_out", "qvel_out", "warmstart_out"), (n, self.gripper.num_qpos))
         dims = rows | dict.fromkeys(("contact_out", "sound_out"), (n,))
         return tuple(self._step_call(self._handle(n), scene, *rest, output_dims=dims))
 
@@ -215,12 +224,12 @@ def _place(
     alive_out[world] = active[world]
     mocap_pos_out[world, 1] = _away()
     mocap_quat_out[world, 1] = wp.quat(1.0, 0.0, 0.0, 0.0)  # MuJoCo's order: w first
-    for i in range(N_QPOS):
+    for i in range(qpos.shape[1]):
         qpos_out[world, i] = 0.0
     if active[world]:
         mocap_pos_out[world, 1] = wp.vec3(pose[world, 0], pose[world, 1], pose[world, 2])
         mocap_quat_out[world, 1] = wp.quat(pose[world, 3], pose[world, 4], pose[world, 5], pose[world, 6])
-        for i in range(N_QPOS):
+        for i in range(qpos.shape[1]):
             qpos_out[world, i] = qpos[world, i]
 
 
@@ -232,7 +241,7 @@ def _good(x: float) -> bool:
 @wp.func
 def _sound(qpos: wp.array2d[float], qvel: wp.array2d[float], qacc: wp.array2d[float], world: int) -> bool:
     sound = bool(True)  # noqa: UP018  (a variable, in Warp)
-    for i in range(N_QPOS):
+    for i in range(qpos.shape[1]):
         sound = sound and _good(qpos[world, i]) and _good(qvel[world, i]) and _good(qacc[world, i])
     return sound
 
@@ -253,14 +262,14 @@ def _begin_step(
         alive_out[world] = False
         mocap_pos_out[world, 1] = _away()
     if alive_out[world]:
-        for i in range(N_CTRL):
+        for i in range(ctrl_out.shape[1]):
             ctrl_out[world, i] = ctrl[world, step, i]
     else:
-        for i in range(N_QPOS):
+        for i in range(qpos_out.shape[1]):
             qpos_out[world, i] = 0.0
             qvel_out[world, i] = 0.0
             qacc_out[world, i] = 0.0
-        for i in range(N_CTRL):
+        for i in range(ctrl_out.shape[1]):
             ctrl_out[world, i] = 0.0
 
 

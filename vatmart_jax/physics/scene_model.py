@@ -7,17 +7,15 @@ objects is bit-identical to the Scene's own model.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from xml.etree import ElementTree
 
 import mujoco
 import numpy as np
 
 from mjcf_assets import scene_template
 from vatmart_jax.data.banks import HINGE, SceneBank
-
-TIP = 0.1122  # from the hand's origin to the fingertips along z, unit lengths
-FINGER_OPEN = 0.04  # of each finger
-N_QPOS, N_CTRL = 9, 8  # part, hand (x y z rx ry rz), two fingers; actuators drive all but the part
-PART, HAND, FINGERS = 0, slice(1, 7), slice(7, 9)
+from vatmart_jax.physics.config import PhysicsConfig
+from vatmart_jax.physics.gripper import GRIPPERS, Gripper
 
 # What the compiler makes different between Scenes, less what nothing reads with the midphase off (bvh_*, mesh_*).
 SCENE_FIELDS = (
@@ -26,43 +24,6 @@ SCENE_FIELDS = (
     "body_invweight0", "body_sameframe", "body_simple",
     "jnt_axis", "jnt_range", "jnt_pos", "dof_invweight0", "dof_M0", "actuator_acc0",
 )  # fmt: skip
-
-
-@dataclass(frozen=True)
-class PhysicsConfig:
-    """Constants of the simulation, chosen by experiment (docs/physics.md). SI units; one unit length is one metre."""
-
-    timestep: float = 0.004
-    """halving it changes the final joint value by under 1 mrad or 1 mm in the median"""
-    steps_per_waypoint: int = 100
-    """0.4 s; 0.6 s gives the same success of scripted pushes"""
-    ramp_fraction: float = 0.7
-    """min-jerk over this share of a waypoint, then hold: coasting dies within the hold"""
-    iterations: int = 10
-    """Newton converges in 5 with the pyramidal cone"""
-    ls_iterations: int = 10
-    impratio: float = 4.0
-    """pyramidal cone, 2 mm slip in a pull; elliptic with 10 needs 50 iterations"""
-    friction: float = 2.0
-    torsional_friction: float = 0.005
-    contact_solref: tuple[float, float] = (0.01, 1.0)
-    contact_solimp: tuple[float, float, float] = (0.95, 0.99, 0.001)
-    """default contacts and limits are too soft at 60 N on light parts"""
-    hand_mass: float = 1.0
-    hand_inertia: float = 0.01
-    hand_armature: float = 0.02
-    slide_gains: tuple[float, float, float] = (5000.0, 160.0, 60.0)
-    """kp, kv, force limit (N) of the hand's slides: under 0.5 mm tracking error in free motion"""
-    hinge_gains: tuple[float, float, float] = (500.0, 8.0, 30.0)
-    """kp, kv, torque limit (Nm) of the hand's hinges"""
-    finger_gains: tuple[float, float, float] = (600.0, 30.0, 30.0)
-    finger_mass: float = 0.05
-    finger_inertia: float = 2e-5
-    finger_armature: float = 0.1
-    part_inertia: tuple[float, float] = (0.02, 0.2)
-    """joint-space inertia every part is scaled to: hinge (kg m2), slide (kg); density makes 1 to 62 kg of them"""
-    part_damping: tuple[float, float] = (2.0, 10.0)
-    """hinge (Nms/rad), slide (Ns/m): with the inertia above, coasting dies within hundredths of a second"""
 
 
 @dataclass(frozen=True)
@@ -115,8 +76,7 @@ def _mesh_name(shape: int) -> str:
 
 
 def _spec(bank: SceneBank, scene: int, slots: tuple[int, int], config: PhysicsConfig, shapes) -> mujoco.MjSpec:
-    spec = mujoco.MjSpec.from_string(scene_template())
-    spec.compiler.degree = False
+    spec = _template_spec(GRIPPERS.get(config.gripper))
     option = spec.option
     option.timestep, option.impratio = config.timestep, config.impratio
     option.iterations, option.ls_iterations = config.iterations, config.ls_iterations
@@ -145,7 +105,7 @@ def _spec(bank: SceneBank, scene: int, slots: tuple[int, int], config: PhysicsCo
         name="part",
         type=mujoco.mjtJoint.mjJNT_HINGE if hinge else mujoco.mjtJoint.mjJNT_SLIDE,
         axis=bank.axis[scene],
-        range=[0, bank.width[scene]],
+        range=[0, bank.joint_range[scene]],
         limited=True,
         damping=[config.part_damping[bank.joint_type[scene]], 0, 0],
         solref_limit=list(config.contact_solref),
@@ -166,20 +126,34 @@ def _spec(bank: SceneBank, scene: int, slots: tuple[int, int], config: PhysicsCo
             kind = mujoco.mjtGeom.mjGEOM_MESH if hull_bank else mujoco.mjtGeom.mjGEOM_BOX
             body.add_geom(type=kind, **common, **place)
 
-    hand = spec.body("hand")
-    hand.mass, hand.inertia, hand.explicitinertial = config.hand_mass, [config.hand_inertia] * 3, True
-    for joint in hand.joints[3:]:
-        joint.armature = config.hand_armature
-    for side in ("left_finger", "right_finger"):
-        finger = spec.body(side)
-        finger.mass, finger.inertia, finger.explicitinertial = config.finger_mass, [config.finger_inertia] * 3, True
-        finger.joints[0].armature = config.finger_armature
-    gains = [config.slide_gains] * 3 + [config.hinge_gains] * 3 + [config.finger_gains] * 2
-    names = [joint.name for joint in hand.joints] + ["left_finger", "right_finger"]
-    for name, (kp, kv, limit) in zip(names, gains, strict=True):
+    return spec
+
+
+def _template_spec(gripper: Gripper) -> mujoco.MjSpec:
+    """The Scene template with the gripper under `gripper_base`, on six joints of its own, all of them actuated."""
+    scene, own = ElementTree.fromstring(scene_template()), ElementTree.fromstring(gripper.mjcf_text())
+    # In the text, for MjSpec.attach warns of names without a prefix.
+    base = next(body for body in scene.iter("body") if body.get("name") == "gripper_base")
+    (root,) = own.findall("worldbody/body")
+    base.append(root)
+    scene[0:0] = own.findall("default")
+    spec = mujoco.MjSpec.from_string(ElementTree.tostring(scene, "unicode"))
+    spec.compiler.degree = False
+    hand = spec.body(root.get("name"))
+    hand.mass, hand.inertia, hand.explicitinertial = gripper.hand_mass, [gripper.hand_inertia] * 3, True
+    slide, hinge = mujoco.mjtJoint.mjJNT_SLIDE, mujoco.mjtJoint.mjJNT_HINGE
+    for k, name in enumerate(gripper.hand_joints):
+        joint = hand.add_joint(name=name, type=slide if k < 3 else hinge, axis=np.eye(3)[k % 3])
+        joint.armature = 0.0 if k < 3 else gripper.hand_armature
+    for name in gripper.finger_joints:
+        joint = spec.joint(name)
+        joint.armature = gripper.finger_armature
+        finger = joint.parent
+        finger.mass, finger.inertia, finger.explicitinertial = gripper.finger_mass, [gripper.finger_inertia] * 3, True
+    for name, gains in gripper.actuators:
         actuator = spec.add_actuator(name=name, target=name, trntype=mujoco.mjtTrn.mjTRN_JOINT)
-        actuator.set_to_position(kp=kp, kv=kv)
-        actuator.forcerange, actuator.forcelimited = [-limit, limit], True
+        actuator.set_to_position(kp=gains.kp, kv=gains.kv)
+        actuator.forcerange, actuator.forcelimited = [-gains.limit, gains.limit], True
     return spec
 
 

@@ -4,13 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 from flax import struct
 
-from vatmart_jax.envs.env import ACTION, OBSERVATION, Env, EnvState, TrialStart, reward_terms
+from vatmart_jax.envs import Env, EnvState, TrialStart
+from vatmart_jax.envs.rewards import reward_terms
 from vatmart_jax.envs.scripted_policy import scripted_action
 from vatmart_jax.errors import UserError
 from vatmart_jax.rl.replay_buffer import Episode, ReplayBuffer, hindsight
@@ -55,14 +57,15 @@ class ExplorationLoop:
 
     def __init__(self, env: Env, config: ExplorationConfig):
         self.env, self.config = env, config
-        self.td3 = TD3(config.td3, OBSERVATION, ACTION)
+        self.td3 = TD3(config.td3, env.observation_size, env.action_size)
         self.train_iteration = jax.jit(self._train_iteration)
         self.rollout = jax.jit(self._rollout, static_argnames="terminate_on_failure")
 
     def init(self, key: jax.Array) -> ExplorationState:
         """Consumes the key."""
         kt, ks = jax.random.split(key)
-        replay = ReplayBuffer.create(self.config.td3.buffer_size, OBSERVATION, ACTION)
+        env = self.env
+        replay = ReplayBuffer.create(self.config.td3.buffer_size, env.observation_size, env.action_size)
         return ExplorationState(self.td3.init(kt), replay, ks, jnp.zeros((), jnp.int32))
 
     def _rollout(
@@ -92,8 +95,8 @@ class ExplorationLoop:
             shown = scripted_action(self.env, state)
             shown = jnp.clip(shown + noise * jax.random.normal(kx, shown.shape), -1, 1)
             action = jnp.where(jnp.arange(len(action))[:, None] < expert * len(action), shown, action)
-            after = self.env.step(state, action, terminate_on_failure)
-            cost = self.config.tracking_penalty * self.env.task.opening * self.env.tracking_error(after)
+            after = self.env.step(state, action, terminate_on_failure=terminate_on_failure)
+            cost = self.env.tracking_cost(after, self.config.tracking_penalty)
             record = Episode(
                 state.obs, action, after.reward - cost, after.obs, after.done, ~state.done & ~after.physics.diverged,
                 state.displacement, after.displacement, after.info["tip_distance"], after.grasp_held, cost,
@@ -123,8 +126,9 @@ class ExplorationLoop:
         ended = episode.active & episode.done & final.success
         episode = episode.replace(reward=episode.reward - penalty * ended)
         replay = state.replay.insert(*episode.transitions())
-        goals = (config.hindsight_low * env.task.low, 1.1 * env.task.high)
-        replay = replay.insert(*hindsight(episode, kh, goals, env.config.tolerance, reward_terms, penalty))
+        goals = (config.hindsight_low * env.task.goal_range[0], 1.1 * env.task.goal_range[1])
+        reward = partial(reward_terms, config=env.config.reward)
+        replay = replay.insert(*hindsight(episode, kh, goals, env.config.tolerance, reward, penalty))
         td3, losses = self.td3.learn(state.td3, replay, kl)
         made = episode.active.sum()
         metrics = {

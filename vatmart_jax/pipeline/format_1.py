@@ -14,6 +14,10 @@ _ENV = {
     "grasp_cone": "grasp_approach_cone",
 }  # fmt: skip
 _PHYSICS = {"move_share": "ramp_fraction"}
+_OF_THE_GRIPPER = (
+    "hand_mass", "hand_inertia", "hand_armature", "slide_gains", "hinge_gains", "finger_gains", "finger_mass",
+    "finger_inertia", "finger_armature",
+)  # fmt: skip
 _EXPLORE = {
     "pool": "start_pool_size", "random": "random_action_prob", "warmup": "warmup_iters", "strain": "tracking_penalty",
 }  # fmt: skip
@@ -45,7 +49,7 @@ def settings(value: Mapping[str, Any]) -> dict[str, Any]:
     perception["networks"] = perception_format_1.networks_config(perception["networks"])
     return {
         "env": renamed(value["env"], _ENV),
-        "physics": renamed(value["physics"], _PHYSICS),
+        "physics": renamed({k: v for k, v in value["physics"].items() if k not in _OF_THE_GRIPPER}, _PHYSICS),
         "explore": explore | {"td3": renamed(explore["td3"], _TD3)},
         "perception": perception_format_1.grouped_augmentation(renamed(perception, _PERCEPTION)),
         "schedule": renamed(value["schedule"], _SCHEDULE),

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field, replace
 
 import jax
 
-from vatmart_jax.envs.env import EnvConfig
+from vatmart_jax.envs import EnvConfig
 from vatmart_jax.perception.config import AugmentationConfig, NetworksConfig, PerceptionConfig
 from vatmart_jax.perception.pointnet2 import SMALL
 from vatmart_jax.physics import PhysicsConfig

@@ -7,7 +7,7 @@ from dataclasses import replace
 import jax
 import jax.numpy as jnp
 
-from vatmart_jax.envs.env import Env, EnvState, TrialStart
+from vatmart_jax.envs import Env, EnvState, TrialStart
 from vatmart_jax.perception.grouped_views import GroupedViews
 from vatmart_jax.perception.interaction_buffer import Interactions
 from vatmart_jax.perception.layers import Params

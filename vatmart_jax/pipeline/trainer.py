@@ -13,7 +13,7 @@ import numpy as np
 from flax import struct
 
 from vatmart_jax.data.banks import SLIDE
-from vatmart_jax.envs.env import Env, Task, TrialStart
+from vatmart_jax.envs import Env, Task, TrialStart
 from vatmart_jax.perception import trainer as perception
 from vatmart_jax.perception.config import PerceptionConfig, TaskSpec, for_task
 from vatmart_jax.perception.grouped_views import GroupedViews, group_views, network_points
@@ -256,9 +256,9 @@ def perception_config(settings: Settings, task: Task) -> PerceptionConfig:
 def task_spec(task: Task, tolerance: float) -> TaskSpec:
     """What training the networks needs to know of a task."""
     return TaskSpec(
-        goal_range=(task.low, task.high),
+        goal_range=task.goal_range,
         tolerance=tolerance,
-        relabel_range=task.shift,
+        relabel_range=task.relabel_range,
         slides=task.joint_type == SLIDE,
     )
 

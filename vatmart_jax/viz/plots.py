@@ -1,4 +1,7 @@
-"""Pictures of a run: learning curves, the objects, and what the priors see and propose."""
+"""Figures of a run: learning curves, the objects, reliability, and what the priors see and propose.
+
+Nothing here touches pyplot, so importing it leaves a notebook's backend alone.
+"""
 
 from __future__ import annotations
 
@@ -7,16 +10,15 @@ from pathlib import Path
 from typing import Any
 
 import jax.numpy as jnp
-import matplotlib
 import numpy as np
+from matplotlib import patheffects
+from matplotlib.figure import Figure
+from matplotlib.image import imread
 
 from vatmart_jax import rotations as rot
 from vatmart_jax.atomic_io import atomic_write
+from vatmart_jax.camera import Camera
 from vatmart_jax.trajectory import cumulative_residuals, unpack_trajectory
-
-matplotlib.use("Agg")
-import matplotlib.pyplot as plt
-from matplotlib import patheffects
 
 _STAGE_CURVES = (
     ("explore", ("success", "reward")),
@@ -38,7 +40,9 @@ def curves(rows: Sequence[dict[str, Any]], out: Path) -> None:
     ]
     panels = [(stage, name, points) for stage, name, points in panels if points]
     columns = 4
-    figure, axes = plt.subplots(-(-len(panels) // columns), columns, figsize=(14, 2.6 * -(-len(panels) // columns)))
+    lines = -(-len(panels) // columns)
+    figure = Figure(figsize=(14, 2.6 * lines))
+    axes = figure.subplots(lines, columns)
     for axis, (stage, name, points) in zip(np.ravel(axes), panels, strict=False):
         axis.plot(*zip(*points, strict=True), marker="." if len(points) < 20 else None)
         axis.set_title(f"{stage}: {name}", fontsize=9)
@@ -50,8 +54,9 @@ def curves(rows: Sequence[dict[str, Any]], out: Path) -> None:
 
 
 def reliability_curves(curves: dict[str, dict[str, Any]], out: Path) -> None:
-    """What was said against what happened, one line per name; dots grow with the number of trials."""
-    figure, axis = plt.subplots(figsize=(5.2, 5))
+    """Predicted against observed success, one line per name; dots grow with the number of trials."""
+    figure = Figure(figsize=(5.2, 5))
+    axis = figure.subplots()
     axis.plot([0, 1], [0, 1], "--", color="#999999", lw=1)
     for name, curve in curves.items():
         (line,) = axis.plot(curve["said"], curve["happened"], label=f"{name} (gap {curve['gap']:.2f})")
@@ -69,38 +74,40 @@ def contact_sheet(pictures: list[Path], out: Path, limit: int = 24) -> None:
         return
     columns = min(4, len(pictures))
     rows = -(-len(pictures) // columns)
-    figure, axes = plt.subplots(rows, columns, figsize=(4 * columns, 1.2 * rows), squeeze=False)
+    figure = Figure(figsize=(4 * columns, 1.2 * rows))
+    axes = figure.subplots(rows, columns, squeeze=False)
     for axis in axes.flat:
         axis.axis("off")
     for axis, picture in zip(axes.flat, pictures, strict=False):
-        axis.imshow(plt.imread(picture))
+        axis.imshow(imread(picture))
         axis.set_title(picture.parent.name, fontsize=8)
     _save(figure, out)
 
 
-def priors(
+def priors_figure(
+    out: Path,
+    *,
     points: np.ndarray,
     part_mask: np.ndarray,
     actionability: np.ndarray,
     contact: np.ndarray,
     trajectories: np.ndarray,
     scores: np.ndarray,
-    camera: tuple[float, float],
+    camera: Camera,
     title: str,
-    out: Path,
     standoff: float,
 ) -> None:
     """The cloud as the camera sees it, the heat map on the moving part, and trajectories from the contact point.
 
     points: [N, 3]; part_mask: [N] bool; actionability: [N]; contact: [3]; trajectories: [P, 30], best first, drawn
-    with decreasing weight; scores: [P]; camera: azimuth and elevation (rad) as ViewBank has them.
+    with decreasing weight; scores: [P]; camera: the one that took the cloud; standoff: of the fingertips from the
+    contact at the start.
     """
-    right, upward, toward = _camera(*camera)
-    project = lambda p: np.stack([p @ right, p @ upward], -1)
-    figure, axis = plt.subplots(figsize=(6.4, 5.4))
-    order = np.argsort(points @ toward)
+    figure = Figure(figsize=(6.4, 5.4))
+    axis = figure.subplots()
+    order = np.argsort(-camera.depth(points))
     points, part_mask, actionability = points[order], part_mask[order], actionability[order]
-    flat = project(points)
+    flat = camera.project(points)
     axis.scatter(*flat[~part_mask].T, s=7, c="#c9ccd1", linewidths=0)
     heat = axis.scatter(
         *flat[part_mask].T, s=12, c=actionability[part_mask], cmap="turbo", vmin=0, vmax=1, linewidths=0
@@ -112,12 +119,12 @@ def priors(
         color, width = ("#111111", 2.4) if rank == 0 else ("#8e24aa", 1.4)
         label = f"score {score:.2f}"
         style = {"color": color, "path_effects": outlined, "zorder": 9 - rank}
-        axis.plot(*project(tips).T, "-o", lw=width, ms=4, label=label, **style)
+        axis.plot(*camera.project(tips).T, "-o", lw=width, ms=4, label=label, **style)
         # A short stroke at every waypoint shows where the hand is.
-        hand = project(np.stack([tips, tips - 0.08 * frames[:, :, 2]], 1).reshape(-1, 3)).reshape(-1, 2, 2)
+        hand = camera.project(np.stack([tips, tips - 0.08 * frames[:, :, 2]], 1).reshape(-1, 3)).reshape(-1, 2, 2)
         for segment in hand:
             axis.plot(*segment.T, lw=1, color=color, alpha=0.6, zorder=8 - rank)
-    axis.plot(*project(contact), "*", color="#d50000", ms=13, mec="white", zorder=10)
+    axis.plot(*camera.project(contact), "*", color="#d50000", ms=13, mec="white", zorder=10)
     axis.legend(loc="upper left", bbox_to_anchor=(0, 0), ncols=3, fontsize=8, frameon=False)
     axis.set_aspect("equal")
     axis.axis("off")
@@ -134,18 +141,6 @@ def waypoints(trajectory: np.ndarray, contact: np.ndarray, standoff: float) -> t
     return tips, np.asarray(frames)
 
 
-def _camera(azimuth: float, elevation: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Right, up and towards-the-camera directions; azimuth 0 looks from -x."""
-    a, e = float(azimuth), float(elevation)
-    toward = np.array([-np.cos(a) * np.cos(e), np.sin(a) * np.cos(e), np.sin(e)])
-    right = np.cross([0.0, 0.0, 1.0], toward)
-    right /= np.linalg.norm(right)
-    return right, np.cross(toward, right), toward
-
-
-def _save(figure, out: Path) -> None:
-    try:
-        with atomic_write(out) as part:
-            figure.savefig(part, dpi=110, bbox_inches="tight", format="png")
-    finally:
-        plt.close(figure)
+def _save(figure: Figure, out: Path) -> None:
+    with atomic_write(out) as part:
+        figure.savefig(part, dpi=110, bbox_inches="tight", format="png")

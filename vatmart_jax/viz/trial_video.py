@@ -14,14 +14,12 @@ import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
-from jax.experimental import io_callback
 
 from vatmart_jax.atomic_io import atomic_write
-from vatmart_jax.data.banks import HINGE, SceneBank, ViewBank
-from vatmart_jax.envs.env import TASKS, Env, EnvConfig, EnvState, Task, TrialStart
+from vatmart_jax.data.banks import SceneBank, ViewBank
+from vatmart_jax.envs import TASKS, Env, EnvConfig, EnvState, Task, TrialStart, make_env
 from vatmart_jax.envs.scripted_policy import run_scripted_policy
 from vatmart_jax.errors import OpenGLError, UserError, require_one_of, summarize_error
-from vatmart_jax.physics import Physics, PhysicsState
 from vatmart_jax.physics.scene_model import scene_model
 from vatmart_jax.priors.priors import Priors
 from vatmart_jax.trajectory import TRAJECTORY, unpack_trajectory
@@ -39,30 +37,10 @@ class Recording:
 
     model: mujoco.MjModel  # the Scene's own
     gripper_pose: np.ndarray  # [7]
-    qpos: np.ndarray  # [F, 9]
+    qpos: np.ndarray  # [F, nq]
     path: np.ndarray  # [7, 3] contact point, then where the fingertips were sent: start, grasp (pull), waypoints
     azimuth: float  # rad, of the camera that took the view
     state: EnvState  # the end, B = 1
-
-
-class _Recorder:
-    """Physics that keeps qpos of the first simulation every few steps."""
-
-    def __init__(self, physics: Physics):
-        self.config, self.frames = physics.config, []
-        self._physics = physics
-
-    def reset(self, scene: jax.Array, gripper_pose: jax.Array, qpos: jax.Array) -> PhysicsState:
-        return self._keep(self._physics.reset(scene, gripper_pose, qpos))
-
-    def rollout(self, state: PhysicsState, ctrl: jax.Array, active: jax.Array) -> PhysicsState:
-        pieces = ctrl.reshape(len(ctrl), -1, EVERY, ctrl.shape[-1]).swapaxes(0, 1)
-        run = lambda state, piece: (self._keep(self._physics.rollout(state, piece, active)), None)
-        return jax.lax.scan(run, state, pieces)[0]
-
-    def _keep(self, state: PhysicsState) -> PhysicsState:
-        io_callback(lambda qpos: self.frames.append(np.asarray(qpos)), None, state.qpos[0], ordered=True)
-        return state
 
 
 def play(
@@ -82,11 +60,10 @@ def play(
     """
     bank, views = SceneBank.load(folder / "scenes.npz"), ViewBank.load(folder / "views.npz")
     chosen = np.array([find_scene(bank, scene)])
-    kind = "door" if bank.joint_type[chosen[0]] == HINGE else "drawer"
     priors = Priors.load(run) if run else None
-    name = task or (priors.config.task if priors else f"push-{kind}")
+    name = task or (priors.config.task if priors else f"push-{bank.part_kind[chosen[0]]}")
     require_one_of("--task", name, TASKS)
-    env = Env(bank.select(chosen), views.of_scenes(chosen), TASKS[name], "c", EnvConfig(num_envs=TRIES))
+    env = make_env(bank.select(chosen), views.of_scenes(chosen), TASKS[name], "c", EnvConfig(num_envs=TRIES))
     start = jax.jit(lambda key: env.sample(key, TRIES))(jax.random.key(seed))
     if amount is not None:
         start = start.replace(goal=jnp.full((TRIES,), _amount(amount, env.task)))
@@ -167,14 +144,8 @@ def find_scene(bank: SceneBank, name: str) -> int:
 
 def record(env: Env, start: TrialStart, trajectory: jax.Array) -> Recording:
     """Run one trial ([1] each) frame by frame: what `env.execute` does, in plain MuJoCo."""
-    physics = env.physics
-    env.physics = recorder = _Recorder(physics)
-    try:
-        rotation, residuals = unpack_trajectory(trajectory)
-        end = jax.jit(env.execute)(start.replace(rotation=rotation), residuals)
-        jax.effects_barrier()
-    finally:
-        env.physics = physics
+    rotation, residuals = unpack_trajectory(trajectory)
+    end, qpos = jax.jit(env.record, static_argnums=2)(start.replace(rotation=rotation), residuals, EVERY)
     scene, view = int(end.physics.scene[0]), int(start.view[0])
     hand = np.asarray(end.physics.gripper_pose[0])
     tip = np.asarray(end.point - env.config.standoff * end.start.rotation[:, :, 2])[0]
@@ -183,8 +154,8 @@ def record(env: Env, start: TrialStart, trajectory: jax.Array) -> Recording:
     path = np.concatenate(
         [np.asarray(end.point), tip[None], (tip + end.tip - np.cumsum(moves, 0))[::-1], tip + end.tip]
     )
-    model = scene_model(env.bank, scene, physics.config)
-    return Recording(model, hand, np.stack(recorder.frames), path, float(env.views.azimuth[view]), end)
+    model = scene_model(env.bank, scene, env.physics.config)
+    return Recording(model, hand, np.asarray(qpos[:, 0]), path, float(env.views.azimuth[view]), end)
 
 
 def animate(recording: Recording, path: Path, size: tuple[int, int] = SIZE) -> None:

@@ -13,14 +13,14 @@ from flax import serialization
 
 from vatmart_jax.atomic_io import write_json, write_text
 from vatmart_jax.data.dataset import SPLITS, Data, DataError
-from vatmart_jax.envs.env import TASKS, Env
+from vatmart_jax.envs import TASKS, Env
 from vatmart_jax.envs.scripted_policy import run_scripted_policy
 from vatmart_jax.errors import UserError, require_one_of, require_positive, summarize_error
 from vatmart_jax.evaluation.metrics import wilson_interval
 from vatmart_jax.evaluation.priors_metrics import labelled, priors_metrics
 from vatmart_jax.evaluation.success import Method, downstream, random_method
 from vatmart_jax.perception.grouped_views import group_views
-from vatmart_jax.physics.types import IMPLS
+from vatmart_jax.physics import BACKENDS
 from vatmart_jax.pipeline.exploration import ExplorationLoop, start_pool
 from vatmart_jax.pipeline.presets import Settings
 from vatmart_jax.pipeline.proposal_rollouts import ProposalTrials
@@ -58,7 +58,7 @@ def evaluate(
     for flag, given, known in (("--metrics", metrics, METRICS), ("--methods", methods, METHODS)):
         for name in given:
             require_one_of(flag, name, known)
-    require_one_of("--impl", impl, IMPLS)
+    require_one_of("--impl", impl, BACKENDS.names())
     require_positive("--trials", trials)
     begun = time.monotonic()
     evaluated = []

@@ -16,9 +16,9 @@ from vatmart_jax import __version__
 from vatmart_jax.atomic_io import write_bytes, write_json
 from vatmart_jax.config import to_json
 from vatmart_jax.data.dataset import SPLITS, Data, DataError
-from vatmart_jax.envs.env import TASKS, Env, Task
+from vatmart_jax.envs import TASKS, Env, Task
 from vatmart_jax.errors import require_one_of
-from vatmart_jax.physics.types import IMPLS
+from vatmart_jax.physics import BACKENDS
 from vatmart_jax.pipeline.presets import Settings
 from vatmart_jax.pipeline.run_config import FORMAT
 from vatmart_jax.pipeline.run_dir import RunDir, read_metrics
@@ -36,7 +36,7 @@ def resolve(
 ) -> dict[str, Any]:
     """The config that is written beside every result. Raises UserError for an unknown task or impl."""
     require_one_of("--task", task, TASKS)
-    require_one_of("--impl", impl, IMPLS)
+    require_one_of("--impl", impl, BACKENDS.names())
     return {
         "format": FORMAT,
         "version": __version__,
@@ -100,7 +100,7 @@ def train(
 def priors_config(settings: Settings, task: Task) -> PriorsConfig:
     """What a run with these settings makes priors of. Raises UserError for settings that make none."""
     networks = perception_config(settings, task).networks
-    return PriorsConfig(task.name, task.low, task.high, networks, settings.evaluation.num_augmentations)
+    return PriorsConfig(task.name, *task.goal_range, networks, settings.evaluation.num_augmentations)
 
 
 def environments(data: Data, task: Task, impl: str, settings: Settings) -> dict[str, Env]:
@@ -131,17 +131,17 @@ def draw_priors(priors: Priors, env: Env, key: jax.Array, out: Path) -> None:
         best = np.argsort(-np.asarray(predicted.scores))[:3]
         scene = env.views.scene[view]
         amount = f"{np.degrees(task):.0f} degrees" if env.task.joint_type == 0 else f"{task:.2f}"
-        plots.priors(
-            points,
-            mask,
-            np.asarray(predicted.actionability),
-            np.asarray(predicted.contact),
-            np.asarray(predicted.trajectories)[best],
-            np.asarray(predicted.scores)[best],
-            (float(env.views.azimuth[view]), float(env.views.elevation[view])),
-            f"{env.task.name} by {amount}: {env.bank.category[scene]} {env.bank.object_id[scene]}",
+        plots.priors_figure(
             out / f"priors_{number}.png",
-            env.config.standoff,
+            points=points,
+            part_mask=mask,
+            actionability=np.asarray(predicted.actionability),
+            contact=np.asarray(predicted.contact),
+            trajectories=np.asarray(predicted.trajectories)[best],
+            scores=np.asarray(predicted.scores)[best],
+            camera=env.views.camera(view),
+            title=f"{env.task.name} by {amount}: {env.bank.category[scene]} {env.bank.object_id[scene]}",
+            standoff=env.config.standoff,
         )
 
 
