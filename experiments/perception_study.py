@@ -2,7 +2,7 @@
 
 vatmart train --task push-door --data DATA --out RUN
 python experiments/perception_study.py --run RUN --data DATA --out STUDY \
-    --variants "as it is:" "scaled:perception.scale=0.2,schedule.finetune_rounds=8"
+    --variants "as it is:" "scaled:perception.augmentation.scale=0.2,schedule.finetune_rounds=8"
 
 A variant is a label and fields of the run's settings. Each is a run of its own in STUDY/label, which begins with the
 trials and the policy of RUN and goes on where it was killed; STUDY/study.json compares them.

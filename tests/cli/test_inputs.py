@@ -5,29 +5,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from vatmart_jax.cli.inputs import parse_goal, read_cloud, read_mask
+from vatmart_jax.cli.inputs import read_cloud, read_mask
 from vatmart_jax.errors import UserError
-
-
-@pytest.mark.parametrize(
-    "text, task, value",
-    [
-        ("30deg", "push-door", np.pi / 6),
-        ("0.5rad", "pull-door", 0.5),
-        ("0.5", "push-door", 0.5),
-        ("0.3", "pull-drawer", 0.3),
-    ],
-)
-def test_goals_are_read_in_the_tasks_unit(text: str, task: str, value: float) -> None:
-    assert parse_goal(text, task) == pytest.approx(value)
-
-
-@pytest.mark.parametrize(
-    "text, task", [("30deg", "push-drawer"), ("-1", "push-door"), ("nan", "push-door"), ("", "push-door")]
-)
-def test_goals_that_make_no_sense_are_refused(text: str, task: str) -> None:
-    with pytest.raises(UserError, match="expected a goal above 0 such as"):
-        parse_goal(text, task)
 
 
 @pytest.mark.parametrize(

@@ -15,8 +15,9 @@ from vatmart_jax.errors import UserError
 from vatmart_jax.perception.config import NetworksConfig
 from vatmart_jax.perception.networks import Networks
 from vatmart_jax.perception.pointnet2 import PointNet2Config, SetAbstraction
+from vatmart_jax.priors import load_priors
 from vatmart_jax.priors.export import export
-from vatmart_jax.priors.priors import Priors, PriorsConfig, PriorsError
+from vatmart_jax.priors.priors import Priors, PriorsConfig, PriorsError, random_order
 
 TINY = PointNet2Config(
     n_points=64, levels=(SetAbstraction(16, 0.3, 8, (16,)), SetAbstraction(4, 0.8, 4, (16,))), propagation=((16,),) * 2
@@ -66,6 +67,44 @@ def test_the_contact_lies_on_the_masked_part(priors: Priors, points: np.ndarray)
 def test_clouds_of_any_size_are_taken(priors: Priors, n: int) -> None:
     found = priors.predict(np.random.default_rng(n).normal(size=(n, 3)), 0.3, n_proposals=5)
     assert np.isfinite(found.actionability).all() and found.actionability.shape == (n,)
+
+
+def test_clouds_of_ten_sizes_compile_three_programs_at_most(priors: Priors) -> None:
+    compiled: list[str] = []
+    listen = lambda event, seconds, **_: compiled.append(event) if event.endswith("backend_compile_duration") else None
+    key = jax.random.key(7)
+    jax.monitoring.register_event_duration_secs_listener(listen)
+    try:
+        for n in (70, 300, 900, 1024, 1025, 1600, 1700, 2048, 2049, 4000):
+            cloud = np.random.default_rng(n).uniform(-0.5, 0.5, (n, 3))
+            assert priors.predict(cloud, 0.3, key=key, n_proposals=3).actionability.shape == (n,)
+    finally:
+        jax.monitoring.unregister_event_duration_listener(listen)
+    assert 1 <= len(compiled) <= 3
+
+
+@pytest.mark.parametrize("count", [1, 2, 64, 1000, 1625, 1626, 2000, 2048])
+def test_the_order_of_a_padded_cloud_is_the_permutation_of_the_cloud(count: int) -> None:
+    key = jax.random.key(count)
+    order = np.asarray(random_order(key, 2048, count))
+    np.testing.assert_array_equal(order[:count], jax.random.permutation(key, count))
+    np.testing.assert_array_equal(np.sort(order), np.arange(2048))
+
+
+def test_a_task_outside_of_training_is_warned_of(priors: Priors, points: np.ndarray) -> None:
+    with pytest.warns(UserWarning, match=r"task 1.5: the priors were trained on 0.1 to 0.7"):
+        priors.predict(points, 1.5, n_proposals=2)
+
+
+def test_missing_fields_take_defaults_and_a_name_loads_what_comes_with_the_package(priors, tmp_path) -> None:
+    priors.save(tmp_path / "priors")
+    file = tmp_path / "priors" / "config.json"
+    written = json.loads(file.read_text())
+    assert written["format"] == 2
+    del written["num_augmentations"], written["networks"]["latent_dim"], written["networks"]["encoder"]["kind"]
+    file.write_text(json.dumps(written))
+    assert load_priors(tmp_path).config == priors.config
+    assert load_priors("push-drawer").config.task == "push-drawer"
 
 
 @pytest.mark.parametrize(

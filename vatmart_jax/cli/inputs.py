@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import trimesh
@@ -16,7 +17,8 @@ def read_cloud(path: Path) -> np.ndarray:
         if path.suffix.lower() == ".npy":
             points = np.load(path, allow_pickle=False)
         elif path.suffix.lower() == ".ply":
-            points = np.asarray(trimesh.load(path, process=False).vertices)
+            cloud: Any = trimesh.load(path, process=False)
+            points = np.asarray(cloud.vertices)
         else:
             raise UserError(f"{path}: expected a .npy or .ply file")
     except UserError:
