@@ -59,7 +59,7 @@ def from_json(kind: type[T], value: Any, where: str = "config") -> T:
 
 
 def _parsed(kind: Any, value: Any, where: str) -> Any:
-    if is_dataclass(kind):
+    if is_dataclass(kind) or (isinstance(kind, type) and issubclass(kind, Variant)):
         return from_json(kind, value, where)  # pyright: ignore[reportArgumentType]
     origin = get_origin(kind)
     if origin in (Union, types.UnionType):
