@@ -51,7 +51,14 @@ class Play:
         enable_compilation_cache()
         folder, run = self._folders()
         recording, result = play(
-            folder, self.scene, self.task, self.amount, self.trajectory, self.contact, run, self.seed
+            folder,
+            self.scene,
+            task=self.task,
+            amount=self.amount,
+            trajectory=self.trajectory,
+            contact=self.contact,
+            run=run,
+            seed=self.seed,
         )
         if self.viewer:
             show(recording)

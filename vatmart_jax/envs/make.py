@@ -91,7 +91,7 @@ def make_envs(
             )
     length = max(map(len, rows.values()), default=0)
     return {
-        name: _env(task, config, made, bank, views.select(found), feasible.select(found), length)
+        name: _env(task, config, made, bank, views.select(found), feasible=feasible.select(found), length=length)
         for name, found in rows.items()
     }
 
@@ -109,6 +109,7 @@ def _env(
     physics: Physics,
     bank: SceneBank,
     views: ViewBank,
+    *,
     feasible: FeasibleContacts,
     length: int,
 ) -> Env:

@@ -63,6 +63,7 @@ def priors_metrics(
     grouped_views: GroupedViews,
     positive: Interactions,
     negative: Interactions,
+    *,
     key: jax.Array,
     runs: int = 10,
     proposals: int = 100,

@@ -105,7 +105,7 @@ class MjxPhysics:
             i, ctrl = at
             near, qpos, qvel, warmstart, _, sound = carry
             near = jax.lax.cond(i % RENEW == 0, lambda: nearest(rows, pose, qpos), lambda: near)
-            after = jax.vmap(self._step)(rows, pose, near, qpos, qvel, warmstart, ctrl)
+            after = jax.vmap(self._step)(rows, pose, near, (qpos, qvel, warmstart), ctrl)
             # NaN compares as false.
             sound &= (jnp.abs(jnp.concatenate(after[:3], -1)) < mujoco.mjMAXVAL).all(-1)
             return (near, *after, sound), None
@@ -130,8 +130,9 @@ class MjxPhysics:
     def _rows(self, scene: jax.Array) -> SceneRow:
         return jax.tree.map(lambda table: table[scene], self._scenes)
 
-    def _step(self, row: SceneRow, pose, near: CollisionSlots, qpos, qvel, warmstart, ctrl):
-        """One step of one simulation: its new qpos, qvel, qacc_warmstart, and whether it is in contact."""
+    def _step(self, row: SceneRow, pose, near: CollisionSlots, state, ctrl):
+        """One step of one simulation from its qpos, qvel and qacc_warmstart: the new ones, and whether it touches."""
+        qpos, qvel, warmstart = state
         data = self._data.replace(qpos=qpos, qvel=qvel, qacc_warmstart=warmstart, ctrl=ctrl)
         model = self._with_slots(self._placed(row, pose), near)
         data = self._forward(model, data)
@@ -164,8 +165,8 @@ class MjxPhysics:
         model = self._placed(row, pose)
         at = mjx.kinematics(model, self._data.replace(qpos=qpos))
         boxes = at.geom_xpos[self._boxes], at.geom_xmat[self._boxes], model.geom_size[self._boxes]
-        static = _nearest(row.static, jnp.zeros(3), jnp.eye(3), *boxes, self._near[0])
-        part = _nearest(row.part, at.xpos[self._part], at.xmat[self._part], *boxes, self._near[1])
+        static = _nearest(row.static, (jnp.zeros(3), jnp.eye(3)), boxes, self._near[0])
+        part = _nearest(row.part, (at.xpos[self._part], at.xmat[self._part]), boxes, self._near[1])
         return jax.tree.map(lambda *x: jnp.concatenate(x), static, part)
 
     def _with_slots(self, model: mjx.Model, near: CollisionSlots) -> mjx.Model:
@@ -192,8 +193,12 @@ def _slots(full: Template, geoms: np.ndarray) -> CollisionSlots:
     return CollisionSlots(*(jnp.asarray(a, jnp.int32 if a.dtype.kind == "i" else jnp.float32) for a in arrays))
 
 
-def _nearest(slots: CollisionSlots, pos, mat, box_pos, box_mat, box_half, n: int) -> CollisionSlots:
-    """For each of K boxes the n nearest slots of a body, [K * n], by the widest gap along the six axes of both."""
+def _nearest(slots: CollisionSlots, body, boxes, n: int) -> CollisionSlots:
+    """For each of K boxes the n nearest slots of a body, [K * n], by the widest gap along the six axes of both.
+
+    body: position [3] and rotation [3, 3]. boxes: positions [K, 3], rotations [K, 3, 3] and half extents [K, 3].
+    """
+    (pos, mat), (box_pos, box_mat, box_half) = body, boxes
     apart = box_pos - (pos + slots.centre @ mat.T)[:, None]  # [N, K, 3]
     mats = mat @ rot.matrix_from_quat(slots.quat)
     turn = jnp.abs(jnp.einsum("nji,kjl->nkil", mats, box_mat))

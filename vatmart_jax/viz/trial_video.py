@@ -17,9 +17,9 @@ import numpy as np
 
 from vatmart_jax.atomic_io import atomic_write
 from vatmart_jax.data.banks import SceneBank, ViewBank
-from vatmart_jax.envs import TASKS, Env, EnvConfig, EnvState, Task, TrialStart, make_env
+from vatmart_jax.envs import Env, EnvConfig, EnvState, Task, TrialStart, get_task, make_env
 from vatmart_jax.envs.scripted_policy import run_scripted_policy
-from vatmart_jax.errors import OpenGLError, UserError, require_one_of, summarize_error
+from vatmart_jax.errors import OpenGLError, UserError, summarize_error
 from vatmart_jax.physics.scene_model import scene_model
 from vatmart_jax.priors.priors import Priors
 from vatmart_jax.trajectory import TRAJECTORY, unpack_trajectory
@@ -46,6 +46,7 @@ class Recording:
 def play(
     folder: Path,
     scene: str,
+    *,
     task: str | None = None,
     amount: float | None = None,
     trajectory: Path | None = None,
@@ -55,15 +56,14 @@ def play(
 ) -> tuple[Recording, dict[str, Any]]:
     """One trial in a Scene of a converted folder, and what came of it.
 
-    scene: object id, id:part, or index. The trial is the scripted expert's, the best proposal of a run's priors, or a
+    scene: object id, id:part, or index. The trial is the scripted policy's, the best proposal of a run's priors, or a
     trajectory file of 30 numbers at a contact point. Raises UserError for what does not fit.
     """
     bank, views = SceneBank.load(folder / "scenes.npz"), ViewBank.load(folder / "views.npz")
     chosen = np.array([find_scene(bank, scene)])
     priors = Priors.load(run) if run else None
     name = task or (priors.config.task if priors else f"push-{bank.part_kind[chosen[0]]}")
-    require_one_of("--task", name, TASKS)
-    env = make_env(bank.select(chosen), views.of_scenes(chosen), TASKS[name], "c", EnvConfig(num_envs=TRIES))
+    env = make_env(bank.select(chosen), views.of_scenes(chosen), get_task(name), "c", EnvConfig(num_envs=TRIES))
     start = jax.jit(lambda key: env.sample(key, TRIES))(jax.random.key(seed))
     if amount is not None:
         start = start.replace(goal=jnp.full((TRIES,), _amount(amount, env.task)))
@@ -92,14 +92,14 @@ def play(
 
 def _amount(amount: float, task: Task) -> float:
     if not amount > 0:
-        raise UserError(f"--amount {amount}: must be above 0; {task.name} takes rad (doors) or unit lengths (drawers)")
+        raise UserError(f"amount {amount}: must be above 0, in {task.unit} for task {task.name}")
     return amount
 
 
 def _proposed(env: Env, priors: Priors, start: TrialStart, seed: int) -> tuple[TrialStart, jax.Array]:
-    """What the priors think best for the first of `start`'s views and tasks."""
+    """The priors' best proposal for the first of `start`'s views and tasks."""
     if priors.config.task != env.task.name:
-        raise UserError(f"--run: its priors are of {priors.config.task}, not of {env.task.name}")
+        raise UserError(f"run: its priors are of {priors.config.task}, not of {env.task.name}")
     view = int(start.view[0])
     cloud, mask = env.views.points[view].astype(np.float32), env.views.part_mask[view]
     found = priors.predict(cloud, float(start.goal[0]), mask, jax.random.key(seed))
@@ -116,7 +116,7 @@ def _given(
         raise UserError(f"{file}: not a .npy file ({summarize_error(e)}); give {TRAJECTORY} numbers") from e
     if not isinstance(numbers, np.ndarray) or numbers.shape != (TRAJECTORY,) or numbers.dtype.kind not in "fiu":
         found = f"shape {numbers.shape}" if isinstance(numbers, np.ndarray) else "an archive"
-        raise UserError(f"{file}: expected {TRAJECTORY} numbers, found {found}; see geometry.pack_trajectory")
+        raise UserError(f"{file}: expected {TRAJECTORY} numbers, found {found}; see trajectory.pack_trajectory")
     if not np.isfinite(numbers).all():
         raise UserError(f"{file}: holds numbers that are not finite")
     start = jax.tree.map(lambda x: x[:1], start)

@@ -158,7 +158,7 @@ def _evaluate_priors(
     if len(positive.view) == 0:
         return {"positives": 0}
     result = priors_metrics(
-        priors.predictor, priors.params, context.views, positive, negative, k_metrics,
+        priors.predictor, priors.params, context.views, positive, negative, key=k_metrics,
         proposals=context.num_proposals,
     )  # fmt: skip
     reporter.progress(f"label trajectories on {split}", 1, 1)
