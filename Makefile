@@ -11,6 +11,7 @@ demo: $(VENV)/.installed ## train on the bundled objects and print success rates
 test: $(VENV)/.installed-test ## lint, types and tests
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
+	$(BIN)/lint-imports
 	$(BIN)/pyright --pythonpath $(BIN)/python
 	$(BIN)/python -m pytest -n auto --dist loadfile
 

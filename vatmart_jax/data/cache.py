@@ -11,7 +11,7 @@ from filelock import FileLock, Timeout
 
 from vatmart_jax.errors import UserError
 
-_WANTED = "expected a folder of objects or what `vatmart convert` made of it"
+WANTED = "expected a folder of objects or what `vatmart convert` made of it"
 
 
 class DataError(UserError):
@@ -30,14 +30,10 @@ def bundled_folder(version: int, count: int, seed: int) -> Path:
 
 
 def is_converted(folder: Path) -> bool:
-    """Whether the folder is what `vatmart convert` makes. Raises DataError where it is no data at all."""
+    """Whether the folder is what `vatmart convert` makes. Raises DataError where there is none."""
     if not folder.is_dir():
-        raise DataError(f"{folder}: no such folder; {_WANTED}")
-    if (folder / "scenes.npz").is_file():
-        return True
-    if (folder / "mobility.urdf").is_file() or not any(folder.glob("*/mobility*.urdf")):
-        raise DataError(f"{folder}: holds neither scenes.npz nor object folders with a mobility.urdf; {_WANTED}")
-    return False
+        raise DataError(f"{folder}: no such folder; {WANTED}")
+    return (folder / "scenes.npz").is_file()
 
 
 def converted_folder(

@@ -6,9 +6,10 @@ from pathlib import Path
 
 from conversion.config import ConvertConfig, ViewConfig
 from conversion.convert import convert
+from conversion.readers import is_object
 from mjcf_assets.procedural.generate import GENERATOR_VERSION, generate
 from vatmart_jax.atomic_io import atomic_directory
-from vatmart_jax.data.cache import bundled_folder, converted_folder, is_converted
+from vatmart_jax.data.cache import WANTED, DataError, bundled_folder, converted_folder, is_converted
 from vatmart_jax.errors import UserError
 from vatmart_jax.pipeline.run_config import DataSource
 from vatmart_jax.reporting import NullReporter, Reporter
@@ -25,6 +26,8 @@ def prepare(data: Path | None, *, num_points: int = 0, reporter: Reporter | None
     reporter = reporter or NullReporter()
     if data is not None and is_converted(data):
         return data
+    if data is not None and (is_object(data) or not any(is_object(f) for f in data.iterdir() if f.is_dir())):
+        raise DataError(f"{data}: holds neither scenes.npz nor object folders that a reader detects; {WANTED}")
     source = bundled_folder(GENERATOR_VERSION, BUNDLED_COUNT, BUNDLED_SEED) if data is None else data
 
     def make(out: Path) -> None:
