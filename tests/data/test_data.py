@@ -71,7 +71,7 @@ def test_views_that_are_made_now_have_the_points_that_a_run_reads(tmp_path, monk
         failed = ()
 
     def convert(sources, out, config):
-        asked.append((sources, config.points))
+        asked.append((sources, config.view.points))
         return Nothing
 
     monkeypatch.setattr("vatmart_jax.workflows.prepare.convert", convert)

@@ -107,7 +107,7 @@ def test_files_that_hold_no_trajectory_are_refused(data, tmp_path, numbers, mess
 def test_tasks_that_a_scene_cannot_do_are_refused(data):
     with pytest.raises(UserError, match="has no drawer"):
         play(data, "100:door", task="pull-drawer")
-    with pytest.raises(UserError, match="task .shove. is not known"):
+    with pytest.raises(UserError, match=r"task .shove. is not known"):
         play(data, "100", task="shove")
     with pytest.raises(UserError, match="amount -1"):
         play(data, "100", amount=-1)
