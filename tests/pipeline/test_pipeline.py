@@ -31,6 +31,8 @@ from vatmart_jax.rl.agent import load_policy
 from vatmart_jax.workflows.environments import split_environments
 from vatmart_jax.workflows.evaluate import METRICS, EvaluationPlan, evaluate
 
+pytestmark = pytest.mark.usefixtures("quick_to_compile")
+
 
 def environment(folder: Path, split: str, task: str) -> Env:
     return split_environments(Data(folder), get_task(task), "c", TINY)[0][split]
