@@ -1,3 +1,6 @@
+# MuJoCo's compiled names are invisible to pyright.
+# pyright: reportAttributeAccessIssue=false
+
 """A converted object as a complete MJCF model that is useful by itself.
 
 Written as XML here rather than by MjSpec: MuJoCo's writer keeps six digits, which is 1e-5 in a link's pose.

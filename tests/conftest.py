@@ -26,6 +26,15 @@ THICK = 0.02  # of boards
 BAR = 0.05  # a handle bar's front stands this far before its panel
 
 
+@pytest.fixture(scope="module")
+def quick_to_compile():
+    """For modules whose programs are small and many: XLA leaves most of its optimizations out."""
+    before = jax.config.read("jax_disable_most_optimizations")
+    jax.config.update("jax_disable_most_optimizations", True)
+    yield
+    jax.config.update("jax_disable_most_optimizations", before)
+
+
 @pytest.fixture(scope="session")
 def real_objects() -> Path:
     """The folder of real PartNet-Mobility objects and splits.json; skips where it is absent."""

@@ -13,6 +13,8 @@ from vatmart_jax.evaluation.methods.base import METHODS, EvalContext, Method, Me
 from vatmart_jax.trajectory import WAYPOINTS
 from vatmart_jax.workflows.evaluate import EvaluationPlan, evaluate_split
 
+pytestmark = pytest.mark.usefixtures("quick_to_compile")
+
 
 @pytest.fixture
 def straight():

@@ -16,6 +16,8 @@ from vatmart_jax.pipeline.stages import STAGES
 from vatmart_jax.pipeline.trainer import PipelineTrainer
 from vatmart_jax.reporting import NullReporter
 
+pytestmark = pytest.mark.usefixtures("quick_to_compile")
+
 
 @dataclass(frozen=True)
 class RandomTrials:

@@ -24,6 +24,8 @@ from vatmart_jax.perception.predictor import TTAPredictor, select_actions
 from vatmart_jax.perception.trainer import init_state, train
 from vatmart_jax.priors import Priors, PriorsConfig
 
+pytestmark = pytest.mark.usefixtures("quick_to_compile")
+
 
 @dataclass(frozen=True)
 class PointNetConfig(EncoderConfig):

@@ -26,6 +26,8 @@ from vatmart_jax.perception.objectives import (
 from vatmart_jax.perception.pointnet2 import PointNet2Config, SetAbstraction
 from vatmart_jax.perception.trainer import init_state, train
 
+pytestmark = pytest.mark.usefixtures("quick_to_compile")
+
 
 def displacement_loss(ctx: LossContext) -> tuple[jax.Array, Metrics]:
     """L1 between the predicted displacement and the observed one."""

@@ -2,19 +2,11 @@
 
 from __future__ import annotations
 
-import jax
 import pytest
 from adapter import RUNS, tiny_run
 from record import held
 
-
-@pytest.fixture(autouse=True)
-def quick_to_compile():
-    """Nearly all the time is compiling, which takes half as long again with XLA's optimizations."""
-    before = jax.config.read("jax_disable_most_optimizations")
-    jax.config.update("jax_disable_most_optimizations", True)
-    yield
-    jax.config.update("jax_disable_most_optimizations", before)
+pytestmark = pytest.mark.usefixtures("quick_to_compile")
 
 
 @pytest.mark.slow

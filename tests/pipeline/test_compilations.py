@@ -14,6 +14,8 @@ from vatmart_jax.envs import TASKS, Env, make_env
 from vatmart_jax.pipeline.run_dir import RunDir
 from vatmart_jax.pipeline.trainer import PipelineTrainer
 
+pytestmark = pytest.mark.usefixtures("quick_to_compile")
+
 PERCEPTION_STAGES = 5  # one program each, of the same name and shapes
 
 

@@ -18,6 +18,7 @@ from vatmart_jax.errors import UserError
 from vatmart_jax.evaluation.methods.base import METHODS, EvalContext
 from vatmart_jax.evaluation.success import evaluate_success
 from vatmart_jax.perception.networks import NetworksConfig
+from vatmart_jax.pipeline import format_1
 from vatmart_jax.pipeline.presets import PRESETS, default_preset
 from vatmart_jax.pipeline.run_config import RunConfig, load_run_policy
 from vatmart_jax.pipeline.run_dir import RunDir, RunError, read_metrics
@@ -29,6 +30,8 @@ from vatmart_jax.reporting import NullReporter
 from vatmart_jax.rl.agent import load_policy
 from vatmart_jax.workflows.environments import split_environments
 from vatmart_jax.workflows.evaluate import METRICS, EvaluationPlan, evaluate
+
+pytestmark = pytest.mark.usefixtures("quick_to_compile")
 
 
 def environment(folder: Path, split: str, task: str) -> Env:
@@ -257,6 +260,19 @@ def test_a_policy_of_format_1_loads_through_the_config_of_its_run(monkeypatch):
     monkeypatch.setattr("vatmart_jax.rl.replay_buffer.ReplayBuffer.create", None)
     agent, policy = load_run_policy(run_folder(Path("push-drawer")))
     assert np.isfinite(agent.act(policy, jax.numpy.ones((1, 33)))).all()
+
+
+@pytest.mark.parametrize(
+    ("field", "value"), [("hand_mass", 2.0), ("slide_gains", [5000.0, 160.0, 61.0]), ("finger_armature", 0.2)]
+)
+def test_a_run_of_format_1_with_another_hand_than_the_panda_is_refused_by_field(field, value):
+    old = json.loads((run_folder(Path("push-drawer")) / "config.json").read_text())
+    assert RunConfig.from_json(old).settings.physics.gripper == "panda"
+    old["settings"]["physics"][field] = value
+    with pytest.raises(ValueError, match=rf"physics\.{field}: the gripper panda has "):
+        format_1.settings(old["settings"])
+    with pytest.raises(UserError, match=rf"physics\.{field}"):
+        RunConfig.from_json(old)
 
 
 def test_a_policy_of_other_sizes_than_described_is_refused(finished, tmp_path):

@@ -16,6 +16,8 @@ from vatmart_jax.pipeline.run_dir import RunDir, read_metrics
 from vatmart_jax.pipeline.settings import Schedule, Settings
 from vatmart_jax.pipeline.trainer import PipelineTrainer
 
+pytestmark = pytest.mark.usefixtures("quick_to_compile")
+
 
 def shrunk(settings: Settings) -> Settings:
     """One unit of each stage with the preset's own switches, and sizes of a toy."""

@@ -210,8 +210,7 @@ class ViewBank:
         return cls(**_load(path, "views", [f.name for f in fields(cls)]))
 
 
-@struct.dataclass(kw_only=True)
-class SceneTable:
+class SceneTable(struct.PyTreeNode, kw_only=True):
     """What the environment needs of S Scenes, on device."""
 
     anchor: jax.Array  # [S, 3] a point on the joint's axis, object frame

@@ -12,8 +12,7 @@ from vatmart_jax.data.banks import SceneBank, ViewBank
 from vatmart_jax.envs.types import EnvConfig, TrialStart, ViewTable
 
 
-@struct.dataclass(kw_only=True)
-class StartTable:
+class StartTable(struct.PyTreeNode, kw_only=True):
     """Probabilities of V views and their C contacts, on device; object frame."""
 
     view_cdf: jax.Array  # [V] cumulative probability of the views

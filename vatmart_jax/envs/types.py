@@ -44,8 +44,7 @@ class EnvConfig:
     reward: RewardConfig = field(default_factory=RewardConfig)
 
 
-@struct.dataclass(kw_only=True)
-class ViewTable:
+class ViewTable(struct.PyTreeNode, kw_only=True):
     """What trials need of V views with C contacts each, on device; object frame."""
 
     scene: jax.Array  # [V] int32, index into the SceneBank
@@ -54,8 +53,7 @@ class ViewTable:
     normals: jax.Array  # [V, C, 3] unit, outward
 
 
-@struct.dataclass(kw_only=True)
-class TrialStart:
+class TrialStart(struct.PyTreeNode, kw_only=True):
     """Where B trials begin."""
 
     view: jax.Array  # [B] int32, index into the environment's views
@@ -64,8 +62,7 @@ class TrialStart:
     rotation: jax.Array  # [B, 3, 3] hand frame, object frame
 
 
-@struct.dataclass(kw_only=True)
-class EnvState:
+class EnvState(struct.PyTreeNode, kw_only=True):
     """B trials, K = 4 waypoints."""
 
     start: TrialStart

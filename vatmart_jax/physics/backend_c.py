@@ -1,3 +1,6 @@
+# MuJoCo's compiled names are invisible to pyright.
+# pyright: reportAttributeAccessIssue=false
+
 """Physics on CPU threads: `mujoco.batch.Batch` behind `jax.pure_callback`."""
 
 from __future__ import annotations

@@ -1,3 +1,6 @@
+# MuJoCo's compiled names are invisible to pyright.
+# pyright: reportAttributeAccessIssue=false
+
 """Physics on any XLA device: MJX, vmapped over simulations of different Scenes."""
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
-# Kernels are Warp's language, which looks like Python.
+# Kernels are Warp's language, which looks like Python; MuJoCo's compiled names are invisible to pyright.
 # pyright: reportIndexIssue=false, reportArgumentType=false, reportOperatorIssue=false
-# pyright: reportAssignmentType=false, reportGeneralTypeIssues=false
+# pyright: reportAssignmentType=false, reportGeneralTypeIssues=false, reportAttributeAccessIssue=false
 """Physics on NVIDIA GPUs (and, slowly, on CPUs): MuJoCo Warp, T steps in one FFI call.
 
 On a GPU a call is one CUDA graph, captured at its first use and replayed from then on; nothing waits for the host.

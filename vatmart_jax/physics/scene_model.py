@@ -1,3 +1,6 @@
+# MuJoCo's compiled names are invisible to pyright.
+# pyright: reportAttributeAccessIssue=false
+
 """One MuJoCo template for every Scene of a joint type: the shared model, and the fields in which Scenes differ.
 
 Each Scene is also compiled alone, and what the compiler computed is copied: a simulation in a batch of different

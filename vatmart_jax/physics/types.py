@@ -12,8 +12,7 @@ from vatmart_jax.physics.config import PhysicsConfig
 from vatmart_jax.physics.gripper import PART, Gripper
 
 
-@struct.dataclass(kw_only=True)
-class PhysicsState:
+class PhysicsState(struct.PyTreeNode, kw_only=True):
     """B simulations, each of its own Scene. qpos: see `vatmart_jax.physics.gripper`."""
 
     scene: jax.Array  # [B] int32, index into the SceneBank

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import astuple, is_dataclass
 from typing import Any
 
 from vatmart_jax.perception import format_1 as perception_format_1
 from vatmart_jax.perception.format_1 import renamed
+from vatmart_jax.physics.gripper import GRIPPERS
 
 _ENV = {
     "batch": "num_envs", "move_range": "max_translation", "turn_range": "max_rotation",
@@ -43,15 +45,26 @@ _EVALUATION = {"proposals": "num_proposals", "copies": "num_augmentations"}
 
 
 def settings(value: Mapping[str, Any]) -> dict[str, Any]:
-    """Settings of format 1, as JSON has them, in format 2."""
+    """Settings of format 1, as JSON has them, in format 2. Raises ValueError for a hand other than the Panda's."""
     explore = renamed(value["explore"], _EXPLORE)
     perception = {k: v for k, v in value["perception"].items() if k not in _FROM_THE_TASK}
     perception["networks"] = perception_format_1.networks_config(perception["networks"])
     return {
         "env": renamed(value["env"], _ENV),
-        "physics": renamed({k: v for k, v in value["physics"].items() if k not in _OF_THE_GRIPPER}, _PHYSICS),
+        "physics": _physics(value["physics"]),
         "explore": explore | {"td3": renamed(explore["td3"], _TD3)},
         "perception": perception_format_1.grouped_augmentation(renamed(perception, _PERCEPTION)),
         "schedule": renamed(value["schedule"], _SCHEDULE),
         "evaluation": renamed(value["evaluation"], _EVALUATION),
     }
+
+
+def _physics(value: Mapping[str, Any]) -> dict[str, Any]:
+    """The hand's fields are the gripper's now, which has no other values of them."""
+    panda = GRIPPERS.get("panda")
+    for name in _OF_THE_GRIPPER:
+        own = getattr(panda, name)
+        own = list(astuple(own)) if is_dataclass(own) and not isinstance(own, type) else own
+        if value.get(name, own) != own:
+            raise ValueError(f"physics.{name}: the gripper panda has {own}, found {value[name]}")
+    return renamed({k: v for k, v in value.items() if k not in _OF_THE_GRIPPER}, _PHYSICS)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar
 
 import jax
 import jax.numpy as jnp
@@ -51,8 +51,8 @@ class TD3State(struct.PyTreeNode):
 class TD3:
     """The agent `td3`: functions of TD3State."""
 
-    name = "td3"
-    config_type = TD3Config
+    name: ClassVar[str] = "td3"
+    config_type: ClassVar[type] = TD3Config
 
     def __init__(self, config: TD3Config, observation_size: int, action_size: int):
         self.config, self.observation_size, self.action_size = config, observation_size, action_size

@@ -1,3 +1,6 @@
+# MuJoCo's compiled names are invisible to pyright.
+# pyright: reportAttributeAccessIssue=false
+
 """`vatmart play`: one trial as an animated picture, or in MuJoCo's viewer."""
 
 from __future__ import annotations
