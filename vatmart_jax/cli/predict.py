@@ -25,7 +25,7 @@ class Predict:
     cloud: Path
     """.npy [N, 3] or .ply: z up, the object's front towards -x, unit lengths"""
     task: str
-    """how far to move the part: 30deg or 0.5rad (doors), 0.3 (drawers, unit lengths)"""
+    """how far to move the part: 30deg or 0.5rad (doors, lids), 0.3 (drawers, unit lengths)"""
     mask: Path | None = None
     """.npy [N] bool: the points of the part to move"""
     proposals: int = 100
