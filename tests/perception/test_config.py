@@ -2,59 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from dataclasses import fields, is_dataclass, replace
+from collections.abc import Iterator
+from dataclasses import fields, replace
 from typing import Any
 
 import jax
 import pytest
+from leaves import perturbed, without_effect
 from synthetic import SPEC, boxes, samples
 
 from vatmart_jax.perception import trainer
 from vatmart_jax.perception.config import NetworksConfig, PerceptionConfig, TaskSpec, for_task
 from vatmart_jax.perception.heads import HEADS, TrajectoryHead
 from vatmart_jax.perception.pointnet2 import LocalGroup, PointNet2Config, SetAbstraction
-
-
-def perturbed(value: Any) -> Iterator[tuple[str, Any]]:
-    """Every leaf of nested dataclasses and tuples of them, by path, and the whole with that leaf changed."""
-    if is_dataclass(value):
-        for field in fields(value):
-            for path, changed in perturbed(getattr(value, field.name)):
-                yield f".{field.name}{path}", lambda c=changed, n=field.name: replace(value, **{n: c()})
-    elif isinstance(value, tuple) and value and is_dataclass(value[0]):
-        for i, item in enumerate(value):
-            for path, changed in perturbed(item):
-                yield f"[{i}]{path}", lambda c=changed, i=i: (*value[:i], c(), *value[i + 1 :])
-    else:
-        yield "", lambda: _other(value)
-
-
-def _other(value: Any) -> Any:
-    if isinstance(value, bool):
-        return not value
-    if isinstance(value, tuple):
-        return tuple(_other(x) for x in value)
-    return value + 1 if isinstance(value, int) else 0.5 * value + 0.01
-
-
-def without_effect(config: Any, observe: Callable[[Any], Iterator[Any]], special: dict[str, Any]) -> list[str]:
-    """Paths of the leaves whose change none of the observations shows. `special`: configs for leaves that cannot be
-    changed alone."""
-    before: list[Any] = []
-    source = observe(config)
-    silent = []
-    for path, changed in perturbed(config):
-        after = observe(special[path] if path in special else changed())
-        for i, seen in enumerate(after):
-            if i == len(before):
-                before.append(next(source))
-            if seen != before[i]:
-                break
-        else:
-            silent.append(path)
-    return silent
-
 
 ENCODER = PointNet2Config(
     n_points=32,
@@ -130,7 +90,7 @@ def test_every_field_of_the_task_has_an_effect() -> None:
     for spec in (SPEC, *(changed() for _, changed in perturbed(SPEC))):
         *_, joint, _ = observe(replace(CONFIG, networks=for_task(CONFIG.networks, slides=True)), spec)
         programs.append(joint)
-    assert len(set(programs)) == len(programs) == 1 + len(fields(TaskSpec))
+    assert len(set(programs)) == len(programs) > len(fields(TaskSpec))
 
 
 def test_a_slide_has_no_axis_to_predict() -> None:
