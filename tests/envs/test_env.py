@@ -394,10 +394,10 @@ def test_a_nan_action_fails_its_own_trial_and_no_other(runs):
 def test_data_without_the_tasks_parts_or_room_is_refused_by_the_tasks_name(cabinets):
     bank, views = cabinets
     doors = np.flatnonzero(bank.joint_type == HINGE)
-    with pytest.raises(ValueError, match=r"no drawer \(slide\), which task push-drawer needs"):
+    with pytest.raises(UserError, match=r"no drawer \(slide\), which task push-drawer needs"):
         make_env(bank.select(doors), views.of_scenes(doors), "push-drawer")
-    with pytest.raises(ValueError, match=r"no view of a door \(hinge\) that can be moved by task pull-door"):
+    with pytest.raises(UserError, match=r"no view of a door \(hinge\) that can be moved by task pull-door"):
         make_env(bank, views.select(views.direction < 0), "pull-door")
     shut = replace(views, joint_pos=np.full_like(views.joint_pos, 0.01))
-    with pytest.raises(ValueError, match="push-door"):
+    with pytest.raises(UserError, match="push-door"):
         make_env(bank, shut, "push-door")
