@@ -12,6 +12,7 @@ from vatmart_jax import rotations as rot
 from vatmart_jax.data.banks import HINGE, SceneBank, ViewBank
 from vatmart_jax.envs import EnvConfig, EnvState, TrialStart, make_env
 from vatmart_jax.envs.rewards import reward_terms
+from vatmart_jax.errors import UserError
 from vatmart_jax.trajectory import WAYPOINTS, unpack_trajectory
 
 BATCH, ACTION, OBSERVATION = 16, 6, 33
