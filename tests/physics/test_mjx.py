@@ -98,9 +98,8 @@ def test_each_box_gets_its_nearest_slots():
     slots = CollisionSlots(*map(jnp.asarray, (pos, quat, half, np.arange(n), pos, half)))
     boxes = rng.uniform(-1, 1, (2, 3))
     eyes = np.tile(np.eye(3), (2, 1, 1))
-    found = _nearest(
-        slots, jnp.zeros(3), jnp.eye(3), jnp.asarray(boxes), jnp.asarray(eyes), jnp.full((2, 3), 0.02), few
-    )
+    body = jnp.zeros(3), jnp.eye(3)
+    found = _nearest(slots, body, (jnp.asarray(boxes), jnp.asarray(eyes), jnp.full((2, 3), 0.02)), few)
     for box, chosen in zip(boxes, np.asarray(found.mesh).reshape(2, few), strict=True):
         nearest = np.argsort(np.linalg.norm(pos - box, axis=1))
         assert set(chosen[:1]) <= set(nearest[:few]) and set(chosen) <= set(nearest[: 2 * few])
