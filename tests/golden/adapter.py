@@ -15,7 +15,8 @@ from unittest import mock
 
 import numpy as np
 
-from conversion.convert import ConvertConfig, convert
+from conversion.config import ConvertConfig, ViewConfig
+from conversion.convert import convert
 from mjcf_assets.procedural.generate import generate
 from vatmart_jax.cli.main import COMMANDS, main
 from vatmart_jax.data.banks import SceneBank, ViewBank
@@ -36,6 +37,8 @@ from vatmart_jax.rl.td3 import TD3Config
 from vatmart_jax.workflows.environments import split_environments
 
 RENAMED: dict[str, str] = {
+    "joint_range": "width",
+    "joint_pos": "q",
     "flow": "course",
     "flow_error": "course_error",
     "flow_loss": "course_loss",
@@ -128,10 +131,13 @@ _DRAWER = replace(
 def convert_generated(folder: Path) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
     """Arrays of the Scenes and of the views of five generated objects with doors and drawers, by golden name."""
     generate(folder / "objects", 5, seed=0)
-    config = ConvertConfig(views=1, points=512, contacts=32)
+    config = ConvertConfig(view=ViewConfig(views=1, points=512, contacts=32))
     convert([folder / "objects"], folder / "converted", config, jobs=2)
     banks = SceneBank.load(folder / "converted" / "scenes.npz"), ViewBank.load(folder / "converted" / "views.npz")
     scenes, views = ({f.name: np.asarray(getattr(bank, f.name)) for f in fields(bank)} for bank in banks)
+    scenes.pop("part_kind")  # new in format 2
+    views = {("opening" if name == "direction" else name): array for name, array in views.items()}
+    views["opening"] = views["opening"] > 0
     return _golden(scenes), _golden(views)
 
 
