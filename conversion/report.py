@@ -1,4 +1,4 @@
-"""The page that tells how faithful a conversion is."""
+"""The HTML report of a conversion's fidelity, object by object."""
 
 from __future__ import annotations
 

@@ -4,7 +4,7 @@ vatmart convert REAL --out DATA
 python experiments/curiosity.py --data DATA --runs RUNS --out experiments/results/curiosity.json
 
 Off means that the penalty is zero: the same rounds, trials and steps, and the policy explores without it. Stopped at
-any moment, the same command goes on where it was; runs that are finished in RUNS are read and not done again.
+any moment, rerunning the command resumes; runs that are finished in RUNS are read and not done again.
 """
 
 import json

@@ -29,7 +29,7 @@ class Pretrain:
 
 
 def main(args: Pretrain) -> None:
-    # Where the objects lay is nobody's business.
+    # Paths of the machine that trained the set are left out.
     config = replace(RunConfig.load(args.run), data=EXTERNAL, more_data=()).to_json()
     priors = Priors.load(args.run)
     with atomic_directory(pretrained.FOLDER / args.name) as folder:

@@ -2,7 +2,7 @@
 
 vatmart convert REAL --out DATA; python experiments/random_trials.py --data DATA --out million.json
 
-Stopped at any moment, the same command goes on where it was. Exit code 1 if a number that is not finite got out.
+Rerunning the command resumes an interrupted run. Exit code 1 if a number that is not finite got out.
 """
 
 import json

@@ -29,7 +29,13 @@ from vatmart_jax.perception.heads import DenseOfParts
 from vatmart_jax.perception.interaction_buffer import Interactions
 from vatmart_jax.perception.networks import Features, Networks
 from vatmart_jax.perception.pointnet2 import LocalGroup, PointNet2Config, SetAbstraction, group
-from vatmart_jax.perception.predictor import TTAPredictor, propose_trajectories, score_trajectories, select_actions
+from vatmart_jax.perception.predictor import (
+    TTAPredictor,
+    encode_contacts,
+    propose_from,
+    score_trajectories,
+    select_actions,
+)
 from vatmart_jax.pipeline.presets import PRESETS
 from vatmart_jax.trajectory import pack_trajectory, unpack_trajectory
 
@@ -464,10 +470,8 @@ def test_the_networks_learn_a_world_that_can_be_learned(world, fresh) -> None:
     success = (valid & (np.abs(moved - task) <= 0.15 * task)).mean()
     point = np.asarray(grouped_views.contacts)
     upper = point[..., 2] > point[..., 2].mean(1, keepdims=True)
-    proposed, _ = propose_trajectories(
-        predictor, state.params, grouped_views, view, jnp.asarray(upper.argmax(1))[view],
-        goal=task, key=jax.random.key(2), num_proposals=20,
-    )  # fmt: skip
+    encoded = encode_contacts(predictor, state.params, grouped_views, view, jnp.asarray(upper.argmax(1))[view])
+    proposed = propose_from(predictor, state.params, encoded, task, key=jax.random.key(2), num_proposals=20)
     moved, valid = outcome(grouped_views, normals, np.asarray(view), upper.argmax(1)[np.asarray(view)], proposed)
     conditional = (valid & (np.abs(moved - task[:, None]) <= 0.15 * task[:, None])).mean()
     actionable = roc_auc_score(upper[np.asarray(view)].ravel(), np.asarray(chosen.actionability).ravel())

@@ -328,7 +328,7 @@ def test_a_test_split_without_objects_is_left_out_by_name_and_reason(converted, 
 
     settings = replace(TINY, schedule=replace(TINY.schedule, stages=("explore",)))
     result = run_tiny(tmp_path, tmp_path / "run", Lines(), settings=settings)
-    assert list(result["left_out"]) == ["test_categories"] and "has no drawer" in result["left_out"]["test_categories"]
+    assert list(result["left_out"]) == ["test_categories"] and "no object" in result["left_out"]["test_categories"]
     assert any(line.startswith("test_categories left out: ") for line in lines)
     found, table = evaluate([tmp_path / "run"], EvaluationPlan(impl="c", metrics=("downstream",), trials=8))
     assert list(found["runs"][0]["left_out"]) == ["test_categories"] and "test_categories: left out" in table

@@ -51,7 +51,7 @@ def main(argv: list[str] | None = None) -> None:
     except UserError as e:
         sys.exit(_fail(str(e)))
     except KeyboardInterrupt:
-        print("vatmart: stopped; the same command goes on where it was", file=sys.stderr)
+        print("vatmart: stopped; rerun the same command to resume", file=sys.stderr)
         sys.exit(130)
     except BrokenPipeError:
         # Whoever read our output has seen enough (`| head`); Python's own flush at exit would fail once more.

@@ -34,7 +34,7 @@ def command(chosen: str) -> type[Any]:
     class Train:
         """Train priors for one task: exploration, perception, curiosity, finetuning, evaluation, pictures.
 
-        Killed at any moment, the same command goes on where it was.
+        Rerunning the same command resumes an interrupted run.
         """
 
         task: str

@@ -71,10 +71,6 @@ class Env:
         """Rows of the view table, those that pad it included."""
         return len(self.view_table.scene)
 
-    @property
-    def num_waypoints(self) -> int:
-        return WAYPOINTS
-
     def sample(self, key: jax.Array, n: int) -> TrialStart:
         """n random starts: category uniform, then object, Scene, view; goal; contact; approach; roll.
 

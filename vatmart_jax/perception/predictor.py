@@ -155,27 +155,6 @@ def propose_from(
 
 
 @partial(jax.jit, static_argnames=("predictor", "num_proposals"))
-def propose_trajectories(
-    predictor: TTAPredictor,
-    params: Params,
-    grouped_views: GroupedViews,
-    view: jax.Array,
-    contact: jax.Array,
-    *,
-    goal: jax.Array,
-    key: jax.Array,
-    num_proposals: int = 100,
-) -> tuple[jax.Array, jax.Array]:
-    """Proposals [B, P, 30] and their scores [B, P] (probabilities) at given contacts [B] int. Consumes the key."""
-
-    def propose(view: jax.Array, contact: jax.Array, goal: jax.Array, key: jax.Array) -> tuple[jax.Array, jax.Array]:
-        f = _encode(predictor, params, grouped_views, view, contact)
-        return predictor.propose_and_score(params, f, grouped_views.contacts[view, contact], goal, key, num_proposals)
-
-    return _over_rows(propose, view, contact, goal, jax.random.split(key, len(view)))
-
-
-@partial(jax.jit, static_argnames=("predictor", "num_proposals"))
 def explore_actions(
     predictor: TTAPredictor,
     params: Params,

@@ -1,4 +1,4 @@
-"""The run folder: config, metrics, checkpoints. Killed at any moment, the same command goes on where it was."""
+"""The run folder: config, metrics, checkpoints. Rerunning the same command resumes an interrupted run."""
 
 from __future__ import annotations
 

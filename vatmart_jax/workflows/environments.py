@@ -28,9 +28,16 @@ def split_environments(
         envs = make_envs(data.scenes, data.views, there, task, required=required, **options)
     except UserError as e:
         raise DataError(f"{data.folder}: {e}") from e
-    left_out = {
-        split: f"{data.folder}: has no {'view of a ' * (split in there)}{task.part} of this split for task {task.name}"
-        for split in splits
-        if split not in envs
-    }
+    left_out = {split: _reason(data, split, task, there) for split in splits if split not in envs}
     return {split: envs[split] for split in splits if split in envs}, left_out
+
+
+def _reason(data: Data, split: str, task: Task, there: Collection[str]) -> str:
+    """Why a split has no environment."""
+    if split not in there:
+        return f"{data.folder}: has no object of the split {split}; see splits.json"
+    of_kind = (data.scenes.split == split) & (data.scenes.part_kind == task.part_kind)
+    lacks = (
+        f"view of a {task.part} that task {task.name} can move; convert with more views" if of_kind.any() else task.part
+    )
+    return f"{data.folder}: the split {split} has no {lacks}"
