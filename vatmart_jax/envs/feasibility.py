@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import jax
@@ -45,11 +46,12 @@ def feasible_contacts(
     """
     if not task.grasps:
         return FeasibleContacts(contact=candidates, grasps=None)
+    hand_fits = _hand_fits(physics, standoff)  # one program for every approach
     fits = np.zeros_like(candidates)
     grasps: Grasps | None = None
     for approach in task.handle_approach:
         option = canonical_grasps(bank, views, approach)
-        found = _hand_fits(physics, views, candidates & ~fits, option, standoff)
+        found = _where_it_fits(hand_fits, views, candidates & ~fits, option)
         grasps = (
             option
             if grasps is None
@@ -60,12 +62,10 @@ def feasible_contacts(
     return FeasibleContacts(contact=np.where(handle.any(1, keepdims=True), handle, fits), grasps=grasps)
 
 
-def _hand_fits(physics: Physics, views: ViewBank, tested: np.ndarray, grasps: Grasps, standoff: float) -> np.ndarray:
-    """[V, C] bool, of the tested ones: the open hand is free before the canonical grasp and when it has advanced."""
-    gripper, start = physics.gripper, views.joint_pos
-    opening = jnp.full((_FIT_BATCH,), gripper.max_opening)
+def _hand_fits(physics: Physics, standoff: float) -> Callable[..., jax.Array]:
+    """A compiled test of _FIT_BATCH starts: is the open hand free before the grasp and when it has advanced?"""
+    gripper, opening = physics.gripper, jnp.full((_FIT_BATCH,), physics.gripper.max_opening)
 
-    @jax.jit
     def fits(scene: jax.Array, q: jax.Array, contact: jax.Array, rotation: jax.Array) -> jax.Array:
         def free(depth: float) -> jax.Array:
             pose = [gripper.hand_position(contact, rotation, depth), rot.quat_from_matrix(rotation)]
@@ -74,6 +74,11 @@ def _hand_fits(physics: Physics, views: ViewBank, tested: np.ndarray, grasps: Gr
 
         return free(-standoff) & free(_FIT_DEPTH)
 
+    return jax.jit(fits)
+
+
+def _where_it_fits(fits: Callable[..., jax.Array], views: ViewBank, tested: np.ndarray, grasps: Grasps) -> np.ndarray:
+    """[V, C] bool, of the tested contacts those where the open hand fits for the canonical grasp."""
     rows = np.argwhere(tested)
     found = np.zeros_like(tested)
     for first in range(0, len(rows), _FIT_BATCH):
@@ -81,5 +86,5 @@ def _hand_fits(physics: Physics, views: ViewBank, tested: np.ndarray, grasps: Gr
         view, contact = rows[np.minimum(np.arange(first, first + _FIT_BATCH), len(rows) - 1)].T
         y, z = grasps.closing[view, contact], grasps.approach[view, contact]
         rotation = np.stack([np.cross(y, z), y, z], -1)
-        found[view, contact] = fits(views.scene[view], start[view], views.contacts[view, contact], rotation)
+        found[view, contact] = fits(views.scene[view], views.joint_pos[view], views.contacts[view, contact], rotation)
     return found

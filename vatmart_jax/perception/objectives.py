@@ -87,7 +87,7 @@ class TrainingStage:
     """Objectives that are trained together; networks of no objective stay as they are."""
 
     objectives: tuple[str, ...] | None
-    """None: all that are registered"""
+    """the last is the one that the stage is there for; None: all that are registered"""
     encoder: Literal["full", "slow", "frozen"]
     """the learning rate of an encoder that all heads share and of the flow head: as the others', times
     `encoder_lr_scale` where there is a flow head, or none"""

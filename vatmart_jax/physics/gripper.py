@@ -39,7 +39,6 @@ class Gripper:
     max_opening: float  # of each finger
     finger_joints: tuple[str, ...] = ("left_finger", "right_finger")
     geoms: tuple[str, ...] = ("hand", "left_finger", "right_finger")
-    mirror_symmetric: bool = True  # about the plane between the fingers: augmentation may mirror its trajectories
     slide_gains: Gains = Gains(5000.0, 160.0, 60.0)  # hand: under 0.5 mm tracking error in free motion
     hinge_gains: Gains = Gains(500.0, 8.0, 30.0)  # hand
     finger_gains: Gains = Gains(600.0, 30.0, 30.0)

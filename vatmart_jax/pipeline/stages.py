@@ -21,6 +21,8 @@ from vatmart_jax.perception.config import PerceptionConfig, TaskSpec
 from vatmart_jax.perception.grouped_views import GroupedViews, group_views
 from vatmart_jax.perception.interaction_buffer import Interactions
 from vatmart_jax.perception.layers import Params
+from vatmart_jax.perception.objectives import OBJECTIVES
+from vatmart_jax.perception.objectives import STAGES as TRAINING_STAGES
 from vatmart_jax.perception.predictor import TTAPredictor, score_trajectories
 from vatmart_jax.pipeline.exploration import ExplorationLoop, start_pool
 from vatmart_jax.pipeline.proposal_rollouts import ProposalTrials, interactions_of, select_curious
@@ -100,7 +102,7 @@ class Stage(Protocol):
 
     @property
     def shown(self) -> tuple[str, ...]:
-        """Metrics for the console."""
+        """Metrics for the console and the curves."""
         ...
 
     def num_units(self, settings: Settings) -> int:
@@ -168,7 +170,12 @@ class Learn:
 
     name: str
     steps: Callable[[Settings], int]
-    shown: tuple[str, ...]
+
+    @property
+    def shown(self) -> tuple[str, ...]:
+        """Of the objective that the stage is there for, which its list ends with."""
+        objectives = TRAINING_STAGES.get(self.name).objectives or OBJECTIVES.names()
+        return ("loss", *OBJECTIVES.get(objectives[-1]).curves)
 
     def num_units(self, settings: Settings) -> int:
         return -(-self.steps(settings) // settings.perception.log_every)
@@ -188,7 +195,7 @@ class Curiosity:
     """Exploration penalised by the scorer's confidence, then perception on what it found: one round a unit."""
 
     name: str = "curiosity"
-    shown: tuple[str, ...] = ("success", "reward", "novel", "loss")
+    shown: tuple[str, ...] = ("success", "reward", "novel", "curiosity", "loss")
 
     def num_units(self, settings: Settings) -> int:
         return settings.schedule.curiosity_rounds
@@ -246,10 +253,10 @@ def _flow_steps(settings: Settings) -> int:
 for _stage in (
     Explore(),
     Collect(),
-    Learn("flow", _flow_steps, ("loss", "flow_error")),
-    Learn("scorer", lambda settings: settings.schedule.scorer_steps, ("loss", "score_loss")),
-    Learn("proposal", lambda settings: settings.schedule.proposal_steps, ("loss", "score_loss", "kl_loss")),
-    Learn("actionability", lambda settings: settings.schedule.actionability_steps, ("loss", "actionability_loss")),
+    Learn("flow", _flow_steps),
+    Learn("scorer", lambda settings: settings.schedule.scorer_steps),
+    Learn("proposal", lambda settings: settings.schedule.proposal_steps),
+    Learn("actionability", lambda settings: settings.schedule.actionability_steps),
     Curiosity(),
     Finetune(),
 ):

@@ -5,7 +5,7 @@ Nothing here touches pyplot, so importing it leaves a notebook's backend alone.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -20,22 +20,12 @@ from vatmart_jax.atomic_io import atomic_write
 from vatmart_jax.camera import Camera
 from vatmart_jax.trajectory import cumulative_residuals, unpack_trajectory
 
-_STAGE_CURVES = (
-    ("explore", ("success", "reward")),
-    ("flow", ("flow_error",)),
-    ("scorer", ("score_loss",)),
-    ("proposal", ("position_loss", "euler_loss", "rotation_loss", "kl_loss")),
-    ("actionability", ("actionability_loss", "actionability_target")),
-    ("curiosity", ("success", "novel", "curiosity")),
-    ("finetune", ("success", "score_loss")),
-)
 
-
-def curves(rows: Sequence[dict[str, Any]], out: Path) -> None:
-    """One panel per stage and metric of what a run logged, see `read_metrics`."""
+def curves(rows: Sequence[dict[str, Any]], metrics: Mapping[str, Sequence[str]], out: Path) -> None:
+    """One panel per stage and metric of what a run logged, see `read_metrics`. metrics: names, by the stage's."""
     panels = [
         (stage, name, [(r["step"], r[name]) for r in rows if r["stage"] == stage and name in r])
-        for stage, names in _STAGE_CURVES
+        for stage, names in metrics.items()
         for name in names
     ]
     panels = [(stage, name, points) for stage, name, points in panels if points]

@@ -88,7 +88,7 @@ def _evaluate(
 
 
 def _draw(trainer: PipelineTrainer, priors: Priors, envs: dict[str, Env], data: Data, out: Path) -> None:
-    plots.curves(read_metrics(out), out / "curves.png")
+    plots.curves(read_metrics(out), {stage.name: stage.shown for stage in trainer.stages}, out / "curves.png")
     plots.contact_sheet([data.folder / i / "picture.png" for i in _objects(list(envs.values()))], out / "objects.png")
     shown = next((env for split, env in envs.items() if split != "train"), envs["train"])
     draw_priors(priors, shown, trainer.key("pictures"), out)
