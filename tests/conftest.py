@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import os
 from dataclasses import dataclass
 from pathlib import Path
@@ -24,6 +25,15 @@ jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.3)
 REAL_OBJECTS = Path(__file__).parents[2] / "shared" / "partnet_mobility"
 THICK = 0.02  # of boards
 BAR = 0.05  # a handle bar's front stands this far before its panel
+
+
+@pytest.fixture(scope="module", autouse=True)
+def programs_of_one_module():
+    """Compiled programs go with their module: each takes memory maps, of which a process has 65,530 on Linux, and XLA
+    aborts where there are none left."""
+    yield
+    jax.clear_caches()
+    gc.collect()
 
 
 @pytest.fixture(scope="module")
