@@ -24,7 +24,7 @@ from vatmart_jax.perception.articulation_flow import (
 from vatmart_jax.perception.augmentation import SceneTransform, tta_transforms
 from vatmart_jax.perception.batching import draw_batch, index_by_view, transform_view
 from vatmart_jax.perception.config import AugmentationConfig, NetworksConfig, PerceptionConfig, for_task
-from vatmart_jax.perception.grouped_views import GroupedViews
+from vatmart_jax.perception.grouped_views import GroupedViews, group_points
 from vatmart_jax.perception.heads import DenseOfParts
 from vatmart_jax.perception.interaction_buffer import Interactions
 from vatmart_jax.perception.networks import Features, Networks
@@ -286,6 +286,17 @@ def test_a_course_about_a_hinge_is_an_arc_however_features_and_tasks_broadcast(w
     np.testing.assert_allclose(articulation_flow(true_axis, true_arm, task, hinge=True), truth, atol=1e-5)
     with pytest.raises(ValueError, match="predict_axis is of the flow head"):
         replace(FLOW.networks, flow_hidden=(), predict_axis=True)
+
+
+@pytest.mark.parametrize("patch", [(), (8,)], ids=["without a gripper patch", "with one"])
+def test_contacts_that_are_encoded_once_give_proposals(world, patch) -> None:
+    encoder = replace(TINY, local_groups=(LocalGroup(0.3, 4, (16,)),)) if patch else TINY
+    networks = Networks(NetworksConfig(encoder=encoder, gripper_patch_hidden=patch))
+    views = group_points(np.asarray(world[0].points), np.asarray(world[0].contacts), encoder.build())
+    predictor, params = TTAPredictor(networks, 2), networks.init(jax.random.key(0))
+    encoded = encode_contacts(predictor, params, views, jnp.arange(20), jnp.arange(20))
+    proposed = propose_from(predictor, params, encoded, jnp.full(20, 0.3), key=jax.random.key(1), num_proposals=3)
+    assert proposed.shape == (20, 3, 30) and np.isfinite(proposed).all()
 
 
 def test_an_ensemble_says_the_mean_over_copies_of_what_it_proposes_for_the_view(world, data) -> None:

@@ -20,6 +20,8 @@ from vatmart_jax.perception.grouped_views import GroupedViews
 from vatmart_jax.perception.layers import Params
 from vatmart_jax.perception.networks import Features, Networks
 
+_ROWS = 16  # worked on at once
+
 
 @dataclass(frozen=True)
 class TTAPredictor:
@@ -225,5 +227,11 @@ def _encode(
 
 def _over_rows(function: Callable, *rows):
     """function over the leading dimension, some rows at a time: a whole batch's groups would not fit into memory."""
-    size = min(16, len(jax.tree.leaves(rows)[0]))
-    return jax.lax.map(lambda row: function(*row), rows, batch_size=size)
+    count = len(jax.tree.leaves(rows)[0])
+    # In batches of our own, the last one filled up with the last row: `map` with a batch size compiles the function
+    # twice where a remainder is left, and fails on arrays of no size (offsets of networks without a gripper patch).
+    size = min(_ROWS, count)
+    numbers = jnp.minimum(jnp.arange(-(-count // size) * size), count - 1).reshape(-1, size)
+    of_row = lambda number: function(*jax.tree.map(lambda x: x[number], rows))
+    out = jax.lax.map(jax.vmap(of_row), numbers)
+    return jax.tree.map(lambda x: x.reshape(numbers.size, *x.shape[2:])[:count], out)
