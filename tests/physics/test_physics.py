@@ -183,10 +183,14 @@ def test_halving_the_time_step_hardly_moves_the_part(cabinets):
 
 
 @pytest.mark.skipif(not hasattr(os, "sched_setaffinity"), reason="CPUs are not assigned here")
-def test_a_single_cpu_does_not_wait_for_itself() -> None:
-    program = """
-import os; os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})
-from vatmart_jax.host_threads import allow_callbacks; allow_callbacks()
+@pytest.mark.parametrize(
+    "first",
+    ["from vatmart_jax.host_threads import allow_callbacks as f", "from vatmart_jax.physics import default_impl as f"],
+)
+def test_a_single_cpu_does_not_wait_for_itself(first: str) -> None:
+    program = f"""
+import os; os.sched_setaffinity(0, {{min(os.sched_getaffinity(0))}})
+{first}; f()
 import jax, jax.numpy as jnp, numpy as np
 x = jnp.full((512, 512), 1e-3)
 twice = lambda x: jax.pure_callback(lambda x: 2 * np.asarray(x), jax.ShapeDtypeStruct(x.shape, x.dtype), x @ x).sum()

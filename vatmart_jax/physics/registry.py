@@ -9,6 +9,7 @@ import jax
 
 from vatmart_jax.data.banks import SceneBank
 from vatmart_jax.errors import UserError
+from vatmart_jax.host_threads import allow_callbacks
 from vatmart_jax.physics.config import PhysicsConfig
 from vatmart_jax.physics.types import Physics
 from vatmart_jax.registry import Registry
@@ -21,6 +22,7 @@ BACKENDS.register("jax", "vatmart_jax.physics.backend_mjx:MjxPhysics")
 
 def default_impl() -> str:
     """`warp` where JAX runs on an NVIDIA GPU and MuJoCo Warp is installed, else `c`."""
+    allow_callbacks()  # the next line starts JAX
     return "warp" if jax.default_backend() == "gpu" and find_spec("mujoco_warp") else "c"
 
 

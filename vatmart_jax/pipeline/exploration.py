@@ -9,6 +9,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from flax import struct
 
 from vatmart_jax.envs import Env, EnvState, TrialStart
@@ -180,8 +181,8 @@ def start_pool(env: Env, key: jax.Array, size: int, progress: Callable[[int], No
     found = tried = 0
     while found < size:
         key, sub = jax.random.split(key)
-        start, good = attempt(sub)
-        good = jnp.flatnonzero(good)
+        start, good = jax.device_get(attempt(sub))  # on the host, where a number of rows is no program of its own
+        good = np.flatnonzero(good)
         kept.append(jax.tree.map(lambda x: x[good], start))  # noqa: B023
         found += len(good)
         tried += len(start.view)
@@ -191,4 +192,4 @@ def start_pool(env: Env, key: jax.Array, size: int, progress: Callable[[int], No
                 f"only {found} of {tried} random starts of task {env.task.name} are free, hold and have a free way: "
                 "the objects do not fit the gripper; look at the conversion's report"
             )
-    return jax.tree.map(lambda *parts: jnp.concatenate(parts)[:size], *kept)
+    return jax.tree.map(lambda *parts: jnp.asarray(np.concatenate(parts)[:size]), *kept)

@@ -73,8 +73,8 @@ class StageContext:
         return partial(_curiosity_penalty, self.predictor)
 
     def curiosity_penalty(self, params: Params, weight: float) -> jax.tree_util.Partial:
-        """A function of final states for `ExplorationLoop.train_iteration`."""
-        return jax.tree_util.Partial(self._penalty, params, self.views, weight)
+        """A function of final states for `ExplorationLoop.train_iteration`; weight 0 costs nothing."""
+        return jax.tree_util.Partial(self._penalty, params, self.views, jnp.float32(weight))
 
     def success(self, samples: Interactions) -> jax.Array:
         """[B] bool"""
@@ -129,7 +129,9 @@ class Explore:
 
     def run_unit(self, ctx: StageContext, state: TrainState, unit: int) -> tuple[TrainState, Metrics]:
         late = round(ctx.settings.schedule.late_fraction * ctx.settings.explore.iterations)
-        explored, final, metrics = ctx.explorer.train_iteration(state.explore, ctx.pool, None)
+        # Weighed by nothing, and not None: the stage `curiosity` runs the same program.
+        unpenalised = ctx.curiosity_penalty(state.perception.params, 0.0)
+        explored, final, metrics = ctx.explorer.train_iteration(state.explore, ctx.pool, unpenalised)
         state = state.replace(explore=explored)
         return (state.with_samples(interactions_of(final)) if unit >= late else state), metrics
 
@@ -268,7 +270,10 @@ def _curiosity_penalty(
 ) -> jax.Array:
     """[B] the paper's curiosity reward with its sign turned: weight times the scorer's confidence."""
     start = final.start
-    score = score_trajectories(
-        predictor, params, views, start.view, start.contact, goal=start.goal, trajectory=final.trajectory
-    )
-    return weight * score
+
+    def penalty() -> jax.Array:
+        return weight * score_trajectories(
+            predictor, params, views, start.view, start.contact, goal=start.goal, trajectory=final.trajectory
+        )
+
+    return jax.lax.cond(weight > 0, penalty, lambda: jnp.zeros_like(start.goal))
