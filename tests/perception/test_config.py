@@ -60,7 +60,7 @@ def observe(config: PerceptionConfig, spec: TaskSpec = SPEC) -> Iterator[Any]:
         return args[0], {}
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(trainer, "train_steps", record)
+        patch.setattr(trainer, "_compiled_steps", lambda: record)
         patch.setattr(trainer, "_init_optimizer", lambda *_: None)
         concrete = trainer.PerceptionState(
             params={}, optimizer=None, step=jax.numpy.int32(0), key=jax.random.key_data(jax.random.key(0))

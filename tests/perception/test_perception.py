@@ -431,12 +431,12 @@ def test_an_interrupted_stage_goes_on_bit_for_bit(world, data, fresh) -> None:
 
 def test_nothing_is_compiled_again_when_samples_steps_or_learning_rate_change(world, data, fresh) -> None:
     buffer = Interactions.empty(4096)
-    before = t.train_steps._cache_size()
+    before = t._compiled_steps()._cache_size()
     for at, steps, rate in ((0, 2, 1e-3), (2000, 13, 1e-3), (4000, 7, 1e-4)):
         buffer = buffer.insert(data, at)
         config = replace(CONFIG, samples_per_view=24, learning_rate=rate)
         fresh = train(fresh, world[0], buffer, config, stage="scorer", steps=steps)
-    assert t.train_steps._cache_size() == before + 1
+    assert t._compiled_steps()._cache_size() == before + 1
 
 
 def test_the_learning_rate_scales_what_a_step_changes(world, data, fresh) -> None:

@@ -185,7 +185,11 @@ def test_halving_the_time_step_hardly_moves_the_part(cabinets):
 @pytest.mark.skipif(not hasattr(os, "sched_setaffinity"), reason="CPUs are not assigned here")
 @pytest.mark.parametrize(
     "first",
-    ["from vatmart_jax.host_threads import allow_callbacks as f", "from vatmart_jax.physics import default_impl as f"],
+    [
+        "from vatmart_jax.host_threads import allow_callbacks as f",
+        "from vatmart_jax.physics import default_impl as f",
+        "from vatmart_jax.cli.common import prepare_jax as f",
+    ],
 )
 def test_a_single_cpu_does_not_wait_for_itself(first: str) -> None:
     program = f"""

@@ -53,7 +53,7 @@ def test_no_program_of_a_whole_run_compiles_twice(cabinets, tmp_path, caplog):
     )
     ours = {what: n for what, n in compiled.items() if not _is_single_operation(what.split("jit(")[1].split(")")[0])}
     assert ours
-    twice = {what: n for what, n in ours.items() if n > (PERCEPTION_STAGES if "_train_steps" in what else 1)}
+    twice = {what: n for what, n in ours.items() if n > (PERCEPTION_STAGES if "train_steps" in what else 1)}
     assert not twice, "\n".join(f"{n} {what}" for what, n in twice.items())
 
 

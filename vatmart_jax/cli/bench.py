@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 from vatmart_jax.atomic_io import write_json
-from vatmart_jax.cli.common import JsonFlag, enable_compilation_cache, names, run_command
+from vatmart_jax.cli.common import JsonFlag, names, prepare_jax, run_command
 from vatmart_jax.envs import TASKS
 from vatmart_jax.errors import UserError, require_one_of
 from vatmart_jax.physics import BACKENDS
@@ -38,7 +38,7 @@ class Bench:
             raise UserError(
                 f"--data: {len(self.data)} folders; give one (parity: or two conversions of the same objects)"
             )
-        enable_compilation_cache()
+        prepare_jax()
         from vatmart_jax.bench.common import SceneSubset
         from vatmart_jax.workflows.prepare import prepare
 

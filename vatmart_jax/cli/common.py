@@ -79,12 +79,15 @@ def peek(argv: list[str], flag: str) -> str | None:
     return None
 
 
-def enable_compilation_cache() -> None:
-    """Compiled programs are kept between runs: it saves a minute or two of every run after the first."""
+def prepare_jax() -> None:
+    """Before a command first uses JAX. Compiled programs are kept between runs, which saves a minute or two of every
+    run after the first."""
     import jax
 
     from vatmart_jax.data.cache import cache_folder
+    from vatmart_jax.host_threads import allow_callbacks
 
+    allow_callbacks()
     if "JAX_COMPILATION_CACHE_DIR" not in os.environ:
         jax.config.update("jax_compilation_cache_dir", str(cache_folder() / "xla"))
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 1.0)

@@ -8,7 +8,7 @@ from typing import Annotated
 
 from tyro.conf import Positional, arg
 
-from vatmart_jax.cli.common import JsonFlag, Output, enable_compilation_cache, names, physics_impl
+from vatmart_jax.cli.common import JsonFlag, Output, names, physics_impl, prepare_jax
 from vatmart_jax.errors import UserError, require_positive
 from vatmart_jax.evaluation.methods.base import METHODS
 from vatmart_jax.reporting import ConsoleReporter
@@ -48,6 +48,6 @@ class Evaluate:
             seed=self.seed,
             data=self.data,
         )
-        enable_compilation_cache()
+        prepare_jax()
         with ConsoleReporter() as reporter:
             return Output(*evaluate(self.runs, plan, out=self.out, reporter=reporter))

@@ -11,7 +11,7 @@ from typing import Annotated, Any
 
 from tyro.conf import Positional, arg
 
-from vatmart_jax.cli.common import JsonFlag, enable_compilation_cache
+from vatmart_jax.cli.common import JsonFlag, prepare_jax
 from vatmart_jax.errors import OpenGLError, UserError, require_one_of
 
 
@@ -48,7 +48,7 @@ class Play:
 
         if self.task is not None:
             require_one_of("--task", self.task, TASKS)
-        enable_compilation_cache()
+        prepare_jax()
         folder, run = self._folders()
         recording, result = play(
             folder,

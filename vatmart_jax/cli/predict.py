@@ -8,7 +8,7 @@ from pathlib import Path
 import jax
 from tyro.conf import Positional
 
-from vatmart_jax.cli.common import JsonFlag, Output, enable_compilation_cache
+from vatmart_jax.cli.common import JsonFlag, Output, prepare_jax
 from vatmart_jax.cli.inputs import read_cloud, read_mask
 from vatmart_jax.envs import get_task
 from vatmart_jax.errors import require_positive
@@ -36,7 +36,7 @@ class Predict:
 
     def run(self) -> Output:
         require_positive("--proposals", self.proposals)
-        enable_compilation_cache()
+        prepare_jax()
         priors = Priors.load(run_folder(self.priors))
         points = read_cloud(self.cloud)
         mask = None if self.mask is None else read_mask(self.mask, len(points))

@@ -7,7 +7,7 @@ from typing import Annotated, Any
 
 from tyro.conf import arg
 
-from vatmart_jax.cli.common import JsonFlag, Output, enable_compilation_cache, peek, physics_impl, run_command
+from vatmart_jax.cli.common import JsonFlag, Output, peek, physics_impl, prepare_jax, run_command
 from vatmart_jax.data.dataset import Data
 from vatmart_jax.envs import TASKS
 from vatmart_jax.errors import UserError, require_one_of
@@ -58,7 +58,7 @@ def command(chosen: str) -> type[Any]:
             require_one_of("--task", self.task, TASKS)
             if self.more_data and self.data is None:
                 raise UserError("--more-data without --data: name what it adds to")
-            enable_compilation_cache()
+            prepare_jax()
             config = RunConfig(
                 task=self.task,
                 data=DataSource.of(self.data),

@@ -56,8 +56,7 @@ class Networks:
         """The point cloud encoder, one for all heads or of each of them."""
         return self.config.encoder.build()
 
-    # It runs once: compiled without optimisation, which takes half the time.
-    @partial(jax.jit, static_argnums=0, compiler_options={"xla_backend_optimization_level": 0})
+    @partial(jax.jit, static_argnums=0)
     def init(self, key: jax.Array) -> Params:
         """Consumes the key. Returns a plain dict with one entry per network."""
         f, contact, goal = jnp.zeros(self.encoder.feature_dim), jnp.zeros(3), jnp.zeros(())

@@ -93,7 +93,7 @@ def train(
         schedule = LearningRateSchedule(
             learning_rate=jnp.float32(config.learning_rate), total=jnp.int32(steps), count=jnp.int32(count)
         )
-        state, sums = train_steps(
+        state, sums = _compiled_steps()(
             state, grouped_views, samples, index, schedule, config=program, spec=spec, stage=stage
         )
         done += count
@@ -113,27 +113,6 @@ def train_steps(
     stage: str,
 ) -> tuple[PerceptionState, Metrics]:
     """`schedule.count` steps of a stage, and the sums of their metrics. The learning rate is the schedule's."""
-    return _train_steps_program()(state, grouped_views, samples, index, schedule, config=config, spec=spec, stage=stage)
-
-
-@cache
-def _train_steps_program() -> Callable[..., tuple[PerceptionState, Metrics]]:
-    # On CPUs LLVM's first level makes steps as fast as its third, in a sixth less time.
-    options = {"xla_backend_optimization_level": 1} if jax.default_backend() == "cpu" else None
-    return jax.jit(_train_steps, static_argnames=("config", "spec", "stage"), compiler_options=options)
-
-
-def _train_steps(
-    state: PerceptionState,
-    grouped_views: GroupedViews,
-    samples: Interactions,
-    index: ViewIndex,
-    schedule: LearningRateSchedule,
-    *,
-    config: PerceptionConfig,
-    spec: TaskSpec,
-    stage: str,
-) -> tuple[PerceptionState, Metrics]:
     labels, optimizer = network_labels(config.networks, stage), _optimizer(config)
     factors = {name: {"full": 1.0, "slow": config.encoder_lr_scale}[label] for name, label in labels.items()}
 
@@ -163,6 +142,13 @@ def _train_steps(
 
     zeros = jax.tree.map(lambda a: jnp.zeros(a.shape, a.dtype), jax.eval_shape(step, state)[1])
     return jax.lax.fori_loop(0, schedule.count, body, (state, zeros))
+
+
+@cache
+def _compiled_steps() -> Callable[..., tuple[PerceptionState, Metrics]]:
+    # On CPUs LLVM's first level makes steps as fast as its third, in a sixth less time.
+    options = {"xla_backend_optimization_level": 1} if jax.default_backend() == "cpu" else None
+    return jax.jit(train_steps, static_argnames=("config", "spec", "stage"), compiler_options=options)
 
 
 def _program(config: PerceptionConfig) -> PerceptionConfig:
