@@ -1,6 +1,7 @@
 from dataclasses import replace
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from pushes import APPROACH, BATCH, EVERYONE, STEPS, Pushes, assert_bitwise
@@ -9,8 +10,9 @@ from scipy.spatial import ConvexHull
 from vatmart_jax.data.banks import HINGE, SceneBank
 from vatmart_jax.physics import PhysicsConfig, make_physics
 from vatmart_jax.physics.backend_c import CPhysics
-from vatmart_jax.physics.backend_mjx import MjxPhysics
+from vatmart_jax.physics.backend_mjx import CollisionSlots, MjxPhysics, _nearest_slots
 from vatmart_jax.physics.gripper import PART
+from vatmart_jax.physics.mjx_boxes import Boxes
 
 
 class MjxPushes(Pushes):
@@ -86,6 +88,22 @@ def test_bad_starts_are_marked_and_stay_as_they_are(doors):
         np.testing.assert_array_equal(s.diverged, np.isin(np.arange(BATCH), [1, 4]))
         assert not s.in_contact[1] and not s.in_contact[4]
     assert_bitwise(state, doors.pushed(), ~np.asarray(state.diverged))
+
+
+def test_each_box_gets_its_nearest_slots():
+    rng = np.random.default_rng(0)
+    n, few = 40, 3
+    quat = rng.normal(size=(n, 4))
+    quat /= np.linalg.norm(quat, axis=1, keepdims=True)
+    pos, half = rng.uniform(-1, 1, (n, 3)), np.full((n, 3), 0.02)
+    slots = CollisionSlots(*map(jnp.asarray, (pos, quat, half, np.arange(n), pos, half)))
+    boxes = rng.uniform(-1, 1, (2, 3))
+    eyes = np.tile(np.eye(3), (2, 1, 1))
+    placed = Boxes(jnp.asarray(boxes), jnp.asarray(eyes), jnp.full((2, 3), 0.02))
+    found = _nearest_slots(slots, slots.boxes, placed, few)
+    for box, chosen in zip(boxes, np.asarray(found.mesh).reshape(2, few), strict=True):
+        nearest = np.argsort(np.linalg.norm(pos - box, axis=1))
+        assert set(chosen[:1]) <= set(nearest[:few]) and set(chosen) <= set(nearest[: 2 * few])
 
 
 def bevelled(bank: SceneBank) -> SceneBank:

@@ -8,7 +8,7 @@ import mujoco
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from vatmart_jax.physics.mjx_boxes import Boxes, box_contacts, gaps, nearest_pairs
+from vatmart_jax.physics.mjx_boxes import Boxes, box_contacts, choose, gaps, nearest_pairs
 
 PAIRS = 300
 OVERLAP = 1e-3  # about as deep as contacts get, unit lengths along a random direction
@@ -90,11 +90,7 @@ def test_the_nearest_pairs_are_chosen_of_all():
     shift = jnp.array([0.1, 0.0, -0.2])
     pairs = nearest_pairs(static, part, (shift, jnp.eye(3)), gripper, 8)
     apart = np.asarray(gaps(static, gripper)), np.asarray(gaps(part.moved(shift, jnp.eye(3)), gripper))
-    placed = jax.tree.map(
-        lambda moved, still: jnp.where(pairs.on_part.reshape(-1, *[1] * (still.ndim - 1)), moved, still),
-        pairs.box.moved(shift, jnp.eye(3)),
-        pairs.box,
-    )
+    placed = choose(pairs.on_part, pairs.box.moved(shift, jnp.eye(3)), pairs.box)
     chosen = jax.tree.map(lambda x: x[pairs.gripper], gripper)
     found = np.diagonal(np.asarray(gaps(placed, chosen)))
     np.testing.assert_allclose(np.sort(found), np.sort(np.concatenate(apart).ravel())[:8], atol=1e-6)

@@ -1,4 +1,4 @@
-"""The contact solver against MJX's, on problems of random contacts."""
+"""The contact solver on problems of random contacts: the gradient says whether it has arrived."""
 
 from __future__ import annotations
 

@@ -62,7 +62,8 @@ class MjxPhysics:
         self.config, self.gripper = config, GRIPPERS.get(config.gripper)
         full = template(bank, config)
         static, part = (np.flatnonzero(full.model.geom_bodyid == full.model.body(b).id) for b in ("object", "part"))
-        self._collision = (_BoxCollision if bank.collision == "box" else _HullCollision)(bank, config, full.model)
+        boxes = bank.collision == "box"
+        self._collision = _BoxCollision(bank, config) if boxes else _HullCollision(bank, config, full.model)
         self._model, self._data = self._collision.model, mjx.make_data(self._collision.model)
         self._base = full.model.body("gripper_base").id
         fields = {
@@ -172,7 +173,7 @@ class MjxPhysics:
 class _BoxCollision:
     """Of a box bank: a list of pairs, which differs from simulation to simulation."""
 
-    def __init__(self, bank: SceneBank, config: PhysicsConfig, full: mujoco.MjModel):
+    def __init__(self, bank: SceneBank, config: PhysicsConfig):
         # One geom stands for all of a body: of a contact's geoms MJX reads the body alone.
         model = scene_model(bank, 0, config, (1, 1))
         self._bodies = np.array([model.geom(name).id for name in ("object_0", "part_0")])
@@ -228,12 +229,10 @@ class _HullCollision:
         half = self.model.geom_size[self._boxes]
         boxes = Boxes(data.geom_xpos[self._boxes], data.geom_xmat[self._boxes], half)
         part = row.part.boxes.moved(data.xpos[self._part], data.xmat[self._part])
-
-        def chosen(slots: CollisionSlots, placed: Boxes, count: int) -> CollisionSlots:
-            rows = jax.lax.top_k(-mjx_boxes.gaps(placed, boxes).T, count)[1].ravel()
-            return jax.tree.map(lambda x: x[rows], slots)
-
-        found = chosen(row.static, row.static.boxes, self._counts[0]), chosen(row.part, part, self._counts[1])
+        found = (
+            _nearest_slots(row.static, row.static.boxes, boxes, self._counts[0]),
+            _nearest_slots(row.part, part, boxes, self._counts[1]),
+        )
         return jax.tree.map(lambda *x: jnp.concatenate(x), *found)
 
     def find(self, model: mjx.Model, data: mjx.Data, near: Any) -> mjx.Data:
@@ -258,6 +257,12 @@ def _slots(full: Template, geoms: np.ndarray) -> CollisionSlots:
     centre = fields["geom_pos"] + np.einsum("snij,snj->sni", mat, centre)
     arrays = (fields["geom_pos"], fields["geom_quat"], fields["geom_size"], fields["geom_dataid"], centre, half)
     return CollisionSlots(*(jnp.asarray(a, jnp.int32 if a.dtype.kind == "i" else jnp.float32) for a in arrays))
+
+
+def _nearest_slots(slots: CollisionSlots, placed: Boxes, boxes: Boxes, count: int) -> CollisionSlots:
+    """For each of K boxes the `count` nearest slots, [K * count], which `placed` has in the boxes' frame."""
+    rows = jax.lax.top_k(-mjx_boxes.gaps(placed, boxes).T, count)[1].ravel()
+    return jax.tree.map(lambda x: x[rows], slots)
 
 
 def _convex_meshes(model: mujoco.MjModel) -> mjx._src.types.ConvexMesh:

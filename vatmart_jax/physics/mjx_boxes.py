@@ -11,6 +11,7 @@ times faster than `mjx.collision`'s arrays of vectors.
 
 from __future__ import annotations
 
+from functools import reduce
 from typing import Any, NamedTuple
 
 import jax
@@ -74,10 +75,16 @@ class _Relation(NamedTuple):
         return own + other
 
 
+def choose(condition: jax.Array, yes: Boxes, no: Boxes) -> Boxes:
+    """[N] of either."""
+    of = lambda x: jnp.expand_dims(condition, tuple(range(condition.ndim, x.ndim)))
+    return jax.tree.map(lambda x, y: jnp.where(of(x), x, y), yes, no)
+
+
 def gaps(boxes: Boxes, others: Boxes) -> jax.Array:
     """[N, K] the widest gap of N and K boxes along the six face axes of each two; negative where they overlap."""
     one = jax.tree.map(lambda x: x[:, None], boxes)
-    return _largest(_relation(one, others).face_gaps())
+    return reduce(jnp.maximum, _relation(one, others).face_gaps())
 
 
 def nearest_pairs(
@@ -93,12 +100,7 @@ def nearest_pairs(
 
 def contacts(pairs: Pairs, part_pose: tuple[jax.Array, jax.Array], gripper: Boxes, count: int) -> Contacts:
     """The `count` deepest contacts of P pairs, up to MANIFOLD of each."""
-    moved = pairs.box.moved(*part_pose)
-    first = jax.tree.map(
-        lambda x, y: jnp.where(jnp.expand_dims(pairs.on_part, tuple(range(pairs.on_part.ndim, x.ndim))), x, y),
-        moved,
-        pairs.box,
-    )
+    first = choose(pairs.on_part, pairs.box.moved(*part_pose), pairs.box)
     second = jax.tree.map(lambda x: x[pairs.gripper], gripper)
     dist, pos, normal = box_contacts(first, second)
     number = jnp.tile(jnp.arange(dist.shape[1], dtype=jnp.int32), len(dist))
@@ -116,7 +118,7 @@ def box_contacts(first: Boxes, second: Boxes) -> tuple[jax.Array, jax.Array, jax
     """
     relation = _computed_once(_relation(first, second))
     faces = _computed_once(relation.face_gaps())
-    face_gap = _largest(faces)
+    face_gap = reduce(jnp.maximum, faces)
     edge_gap, edge = _computed_once(_edge_gap(relation))
     overlap = jnp.maximum(face_gap, edge_gap) < 0
     is_edge = overlap & (edge_gap > face_gap + 1e-6)
@@ -140,13 +142,6 @@ def _computed_once(tree: Any) -> Any:
 
 def _dot(a, b) -> jax.Array:
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
-
-
-def _largest(values: Scalars) -> jax.Array:
-    found = values[0]
-    for value in values[1:]:
-        found = jnp.maximum(found, value)
-    return found
 
 
 def _pick(index: jax.Array, options) -> jax.Array:
@@ -222,12 +217,12 @@ def _face_contacts(
         best = jnp.maximum(faces[number], best)
     # The box with the reference face in the place of the first.
     swapped, axis = face >= 3, face % 3
-    choose = lambda x, y: jnp.where(swapped, y, x)
+    either = lambda x, y: jnp.where(swapped, y, x)
     turn, shift, own, other = relation
     back = [-_dot([turn[i][j] for i in range(3)], shift) for j in range(3)]
-    turn = [[choose(turn[i][j], turn[j][i]) for j in range(3)] for i in range(3)]
-    shift = [choose(shift[i], back[i]) for i in range(3)]
-    own, other = [choose(own[i], other[i]) for i in range(3)], [choose(other[i], own[i]) for i in range(3)]
+    turn = [[either(turn[i][j], turn[j][i]) for j in range(3)] for i in range(3)]
+    shift = [either(shift[i], back[i]) for i in range(3)]
+    own, other = [either(own[i], other[i]) for i in range(3)], [either(other[i], own[i]) for i in range(3)]
     turn, shift, own, other = _computed_once((turn, shift, own, other))
     # Axes u, v and w of the reference box, w out of the face.
     place = lambda x: [_pick(axis, [x[(k + 1 + n) % 3] for k in range(3)]) for n in range(3)]
@@ -249,9 +244,7 @@ def _face_contacts(
     centre, arms = _computed_once((centre, arms))
     dist, u, v, w = _spread(_clipped(centre, arms[1], arms[2], half_u, half_v), half_w)
     # Back into the world.
-    reference = jax.tree.map(
-        lambda x, y: jnp.where(jnp.expand_dims(swapped, tuple(range(swapped.ndim, x.ndim))), y, x), first, second
-    )
+    reference = choose(swapped, second, first)
     columns = [[reference.mat[..., i, j] for j in range(3)] for i in range(3)]
     axes = [place(row) for row in columns]  # [i][u, v, w]
     pos = [reference.pos[..., i] + u * axes[i][0] + v * axes[i][1] + w * up * axes[i][2] for i in range(3)]
@@ -281,7 +274,7 @@ def _clipped(centre: Scalars, a: Scalars, b: Scalars, half_u: jax.Array, half_v:
     inverse = 1 / jnp.where(jnp.abs(area) < 1e-12, 1e-12, area)
     du, dv = s * half_u - centre[0], t * half_v - centre[1]
     x, y = (du * b[1] - dv * b[0]) * inverse, (a[0] * dv - a[1] * du) * inverse
-    found.append([s * half_u + 0 * x, t * half_v + 0 * x, centre[2] + x * a[2] + y * b[2]])
+    found.append([s * half_u, t * half_v, centre[2] + x * a[2] + y * b[2]])
     inside.append((jnp.abs(x) < 1) & (jnp.abs(y) < 1))
     # Where sides of the two cross.
     for along, fixed in ((a, b), (b, a)):

@@ -151,7 +151,8 @@ def _times_transposed(matrix: jax.Array, x: jax.Array) -> jax.Array:
 
 
 def _cholesky_solve(lower: list[list[jax.Array]], b: jax.Array) -> jax.Array:
-    """x of A x = b, given the lower triangle of A as n rows of entries [B], and b [n, B]."""
+    """x of A x = b, given the lower triangle of A as n rows of entries [B], and b [n, B]. LAPACK, which
+    jax.scipy calls once for every matrix, is slower for matrices this small."""
     n = len(lower)
     factor: list[list[jax.Array]] = [[] for _ in range(n)]
     inverse: list[jax.Array] = []  # of the diagonal
