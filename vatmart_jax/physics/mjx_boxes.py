@@ -5,8 +5,8 @@ has its own list of pairs, chosen anew every few steps: the nearest of all. Thei
 edges overlap less than any face does, these touch; else the face that overlaps least is the reference, the other box's
 face most opposed to it is clipped by it, and up to four corners of what is left touch.
 
-A number of every pair is an array of its own here, and no array has an axis of three: so it vectorises on CPUs, four
-times faster than `mjx.collision`'s arrays of vectors.
+A number of every pair is an array of its own here, and no array has an axis of three: so it vectorises on CPUs, where
+arrays of vectors do not.
 """
 
 from __future__ import annotations
@@ -132,7 +132,7 @@ def box_contacts(first: Boxes, second: Boxes) -> tuple[jax.Array, jax.Array, jax
 
 def _computed_once(tree: Any) -> Any:
     """The same numbers, arrays of one shape. XLA fuses what is elementwise into everything that reads it, and computes
-    it there anew: a thousand times in all. It does not reach through a product of matrices, nor keep to
+    it there anew, over and over. It does not reach through a product of matrices, nor keep to
     `optimization_barrier` on CPUs (jax 0.10)."""
     leaves, treedef = jax.tree.flatten(tree)
     flat = jnp.stack([x.ravel() for x in leaves])

@@ -16,7 +16,7 @@ import jax
 import jax.numpy as jnp
 
 ALL_ITERATIONS = 2
-"""of every simulation; four in five need no more"""
+"""of every simulation; three in four need no more"""
 REST = 4
 """those that need more go on together, up to one in so many of the batch at a time"""
 
